@@ -1,0 +1,47 @@
+# Everything happens in .venv, which is made and filled on first use and again when the dependencies change.
+PYTHON := $(shell python3.11 -c "print('python3.11')" 2>/dev/null || echo python3)
+BIN := .venv/bin
+DEPENDENCIES := setup.cfg pyproject.toml constraints.txt
+SOURCES := sb3_ddiffpg tests benchmarks examples train.py enjoy.py record_video.py
+
+.PHONY: demo test fast slow lint type format bench clean
+
+demo: .venv/.installed
+	$(BIN)/python examples/demo.py
+
+test: lint type fast
+
+# one torch thread per worker: the workers already fill the cores
+fast: .venv/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+slow: .venv/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m slow
+
+lint: .venv/.installed-dev
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+
+type: .venv/.installed-dev
+	$(BIN)/mypy
+
+format: .venv/.installed-dev
+	$(BIN)/ruff check --fix $(SOURCES)
+	$(BIN)/ruff format $(SOURCES)
+
+bench: .venv/.installed-dev
+	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
+
+clean:
+	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+
+.venv/.installed: $(DEPENDENCIES) | .venv
+	$(BIN)/pip install --quiet -c constraints.txt -e ".[zoo,plots]"
+	touch $@
+
+.venv/.installed-dev: $(DEPENDENCIES) | .venv
+	$(BIN)/pip install --quiet -c constraints.txt -e ".[zoo,plots,dev]"
+	touch $@ .venv/.installed
+
+.venv:
+	$(PYTHON) -m venv .venv

@@ -1,0 +1,240 @@
+"""Twin distributional critics of the exploratory group and of every mode, stacked in one set of tensors."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch as th
+from torch import nn
+from torch.nn import functional as F
+
+
+class ModeCritics(nn.Module):
+    """
+    The critics of G groups: group 0 explores, group m + 1 is mode m. Each group has ``n_critics`` independent C51 critics
+    (Bellemare et al., 2017), or scalar ones when ``n_atoms=1``. Every layer holds one weight per group and critic, so that
+    all critics are evaluated by one batched product; groups come and go with ``inherit``.
+
+    :param features_dim: Size F of the observation features
+    :param action_dim: Size A of the action
+    :param net_arch: Sizes of the hidden layers
+    :param n_groups: Number of groups G
+    :param activation_fn: Activation of the hidden layers
+    :param n_critics: Critics per group C; the minimum over them is used, as in TD3
+    :param n_atoms: Atoms of the value distribution, 1 for scalar critics
+    :param support: Lower and upper end of the values of the modes' critics
+    :param exploration_support: The same for the exploratory group
+    """
+
+    optimizer: th.optim.Optimizer
+    lower: th.Tensor
+    upper: th.Tensor
+    atoms: th.Tensor
+
+    def __init__(
+        self,
+        features_dim: int,
+        action_dim: int,
+        net_arch: Sequence[int],
+        n_groups: int = 1,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        n_critics: int = 2,
+        n_atoms: int = 51,
+        support: tuple[float, float] = (0.0, 5.0),
+        exploration_support: tuple[float, float] = (0.0, 5.0),
+    ) -> None:
+        super().__init__()
+        if not net_arch:
+            raise ValueError("net_arch['qf'] must name at least one hidden layer, got []")
+        self.n_critics, self.n_atoms = n_critics, n_atoms
+        self.features_dim, self.action_dim = features_dim, action_dim
+        self.activation = activation_fn()
+        sizes = [features_dim + action_dim, *net_arch, n_atoms]
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        for size_in, size_out in pairwise(sizes):
+            bound = 1 / math.sqrt(size_in)  # the uniform initialisation of nn.Linear
+            self.weights.append(nn.Parameter(th.empty(n_groups, n_critics, size_in, size_out).uniform_(-bound, bound)))
+            self.biases.append(nn.Parameter(th.empty(n_groups, n_critics, 1, size_out).uniform_(-bound, bound)))
+        # Supports per group: a table of two rows (exploring, mode) indexed by group
+        lower, upper = th.tensor([exploration_support, support], dtype=th.float32).T
+        self.register_buffer("lower", lower, persistent=False)
+        self.register_buffer("upper", upper, persistent=False)
+        fractions = th.linspace(0, 1, n_atoms)
+        self.register_buffer("atoms", lower[:, None] + fractions * (upper - lower)[:, None], persistent=False)
+        for group in range(n_groups):
+            self._reset_output(group, zero_weights=False)
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups G: the exploratory one and the modes."""
+        return self.weights[0].shape[0]
+
+    def _kind(self) -> th.Tensor:
+        """Row of the support tables for every group, shape [G]."""
+        return th.arange(self.n_groups, device=self.atoms.device).clamp(max=1)
+
+    @th.no_grad()
+    def _reset_output(self, group: int, zero_weights: bool = True) -> None:
+        """
+        Let a group's values start near zero: a uniform distribution would start in the middle of the support,
+        where unseen actions look better than any reachable return.
+        """
+        if zero_weights:
+            self.weights[-1].data[group] = 0.0
+        if self.n_atoms == 1:
+            self.biases[-1].data[group] = 0.0
+            return
+        kind = 0 if group == 0 else 1
+        self.biases[-1].data[group] = -8.0 * self.atoms[kind].abs() / (self.upper[kind] - self.lower[kind])
+
+    def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        :param features: Observation features of each group's rows, shape [G, n, F]
+        :param actions: Shape [G, n, A]
+        :return: Logits over the atoms (values when scalar), shape [G, C, n, n_atoms]
+        """
+        first, bias = self.weights[0], self.biases[0]
+        groups, rows = features.shape[:2]
+        n_nets = groups * self.n_critics
+        # [G, n, F + A] -> [G * C, n, F + A]
+        hidden = th.cat((features, actions), dim=2)[:, None].expand(-1, self.n_critics, -1, -1).reshape(n_nets, rows, -1)
+        hidden = th.baddbmm(bias.flatten(0, 1), hidden, first.flatten(0, 1))
+        for weight, bias in zip(self.weights[1:], self.biases[1:], strict=True):
+            hidden = th.baddbmm(bias.flatten(0, 1), self.activation(hidden), weight.flatten(0, 1))
+        return hidden.unflatten(0, (groups, self.n_critics))
+
+    def values(self, logits: th.Tensor) -> th.Tensor:
+        """
+        :param logits: Output of ``forward``, shape [G, C, n, n_atoms]
+        :return: Expected values, shape [G, C, n]
+        """
+        if self.n_atoms == 1:
+            return logits.squeeze(-1)
+        return (logits.softmax(dim=-1) * self.atoms[self._kind()][:, None, None, :]).sum(dim=-1)
+
+    @th.no_grad()
+    def bellman_target(self, features: th.Tensor, actions: th.Tensor, rewards: th.Tensor, discounts: th.Tensor) -> th.Tensor:
+        """
+        Target of the lower-mean twin: its distribution, shifted by the reward and projected on the support, so that it
+        stays a distribution (an element-wise minimum of two would not sum to one).
+
+        :param features: Features of the bootstrap states, shape [G, n, F]
+        :param actions: Actions there, shape [G, n, A]
+        :param rewards: (n-step) rewards, shape [G, n]
+        :param discounts: gamma^k, or 0 where the episode terminated, shape [G, n]
+        :return: Target probabilities, shape [G, n, n_atoms]; scalar targets, shape [G, n, 1], when ``n_atoms=1``
+        """
+        logits = self(features, actions)
+        values, lower_twin = self.values(logits).min(dim=1)  # [G, n]
+        kind = self._kind()
+        low, high = self.lower[kind][:, None], self.upper[kind][:, None]  # [G, 1]
+        if self.n_atoms == 1:
+            return (rewards + discounts * values).clamp(low, high)[..., None]
+        index = lower_twin[:, None, :, None].expand(-1, 1, -1, self.n_atoms)
+        probabilities = logits.gather(1, index).squeeze(1).softmax(dim=-1)  # [G, n, n_atoms]
+        return project_distribution(probabilities, self.atoms[kind][:, None, :], rewards, discounts)
+
+    def loss(self, features: th.Tensor, actions: th.Tensor, targets: th.Tensor) -> th.Tensor:
+        """
+        :param features: Shape [G, n, F]
+        :param actions: Shape [G, n, A]
+        :param targets: From ``bellman_target``, shape [G, n, n_atoms]
+        :return: Loss of every group, summed over its critics and averaged over its rows, shape [G]
+        """
+        logits = self(features, actions)
+        if self.n_atoms == 1:
+            return (logits - targets[:, None]).pow(2).mean(dim=(2, 3)).sum(dim=1)
+        return -(targets[:, None] * F.log_softmax(logits, dim=-1)).sum(dim=-1).mean(dim=2).sum(dim=1)
+
+    def action_gradient(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        Gradient of min(Q1, Q2) with respect to each row's own action: it does not depend on the batch's size.
+
+        :param features: Shape [G, n, F]
+        :param actions: Shape [G, n, A]
+        :return: Shape [G, n, A]
+        """
+        actions = actions.detach().requires_grad_()
+        with th.enable_grad():
+            value = self.values(self(features, actions)).min(dim=1).values.sum()
+        return th.autograd.grad(value, actions)[0]
+
+    @th.no_grad()
+    def inherit(
+        self, parents: Sequence[int | None], fresh: Sequence[bool], optimizer: th.optim.Optimizer | None, reset_output: bool
+    ) -> None:
+        """
+        Rebuild the stack after a re-clustering, in place: weights and optimiser moments move together.
+
+        :param parents: For every new mode, the old mode whose critics it takes, or None: the exploratory critics
+        :param fresh: For every new mode, whether its optimiser moments restart at zero
+        :param optimizer: Optimiser of this stack (None for a target network)
+        :param reset_output: Whether a mode without parent starts with a zeroed output layer; the exploratory values
+            it copies are on another scale than a mode's
+        """
+        source = th.tensor([0] + [0 if parent is None else parent + 1 for parent in parents], device=self.atoms.device)
+        restart = [group + 1 for group, new in enumerate(fresh) if new]
+        replaced: dict[nn.Parameter, nn.Parameter] = {}
+        for parameters in (self.weights, self.biases):
+            for layer, parameter in enumerate(parameters):
+                replaced[parameter] = nn.Parameter(parameter[source].clone())
+                parameters[layer] = replaced[parameter]
+        if optimizer is not None:
+            for param_group in optimizer.param_groups:
+                param_group["params"] = [replaced.get(parameter, parameter) for parameter in param_group["params"]]
+            for old, new in replaced.items():
+                state = optimizer.state.pop(old, None)
+                if state is None:
+                    continue
+                for name, value in state.items():
+                    if value.shape == old.shape:  # the moments; the step count is shared by all groups
+                        state[name] = value[source].clone()
+                        state[name][restart] = 0.0
+                optimizer.state[new] = state
+        if reset_output:
+            for mode, parent in enumerate(parents):
+                if parent is None:
+                    self._reset_output(mode + 1)
+
+    def stacked_parameters(self) -> list[nn.Parameter]:
+        """
+        :return: The parameters whose first dimension is the group
+        """
+        return [*self.weights, *self.biases]
+
+    @th.no_grad()
+    def clip_gradients(self, max_norm: float) -> None:
+        """
+        Clip every group's gradient on its own: one group's exploding loss must not shrink the steps of the others.
+
+        :param max_norm: Largest allowed norm of one group's gradient
+        """
+        gradients = [parameter.grad for parameter in self.stacked_parameters() if parameter.grad is not None]
+        squares = th.stack([gradient.flatten(1).pow(2).sum(dim=1) for gradient in gradients])
+        scale = (max_norm / (squares.sum(dim=0).sqrt() + 1e-6)).clamp(max=1.0)  # [G]
+        for gradient in gradients:
+            gradient.mul_(scale[:, None, None, None])
+
+
+def project_distribution(probabilities: th.Tensor, atoms: th.Tensor, rewards: th.Tensor, discounts: th.Tensor) -> th.Tensor:
+    """
+    Distributional Bellman projection (Bellemare et al., 2017, algorithm 1): move every atom to ``r + discount * z`` and
+    split its probability between the two neighbouring atoms.
+
+    :param probabilities: Shape [G, n, n_atoms]
+    :param atoms: Equally spaced support, broadcastable to [G, n, n_atoms]
+    :param rewards: Shape [G, n]
+    :param discounts: Shape [G, n], 0 at a terminal state
+    :return: Projected probabilities, shape [G, n, n_atoms]
+    """
+    n_atoms = atoms.shape[-1]
+    low, high = atoms[..., :1], atoms[..., -1:]
+    moved = (rewards[..., None] + discounts[..., None] * atoms).clamp(low, high)
+    position = (moved - low) / ((high - low) / (n_atoms - 1))
+    left = position.floor().clamp(0, n_atoms - 2)
+    right_share = (position - left) * probabilities
+    index = left.long()
+    projected = th.zeros_like(probabilities)
+    projected.scatter_add_(-1, index, probabilities - right_share)
+    return projected.scatter_add_(-1, index + 1, right_share)

@@ -1,0 +1,723 @@
+"""Deep Diffusion Policy Gradient: the algorithm."""
+
+import io
+import pathlib
+import time
+import warnings
+from collections import defaultdict
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from scipy.signal import lfilter
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TensorDict
+from stable_baselines3.common.utils import FloatSchedule, polyak_update, update_learning_rate
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
+from sb3_ddiffpg.callbacks import ClusteringCallback
+from sb3_ddiffpg.clustering import cluster
+from sb3_ddiffpg.critics import ModeCritics
+from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, noveld_reward
+from sb3_ddiffpg.modes import Mode, ModeTable, succeed
+from sb3_ddiffpg.noise import SpreadNormalActionNoise
+from sb3_ddiffpg.policies import EXPLORATORY_GROUP, UNCONDITIONED, DiffusionActor, DiffusionPolicy
+from sb3_ddiffpg.reclustering import find_modes
+from sb3_ddiffpg.target_actions import ascend
+from sb3_ddiffpg.trajectories import Trajectory
+from sb3_ddiffpg.validation import check_arguments
+
+SelfDDiffPG = TypeVar("SelfDDiffPG", bound="DDiffPG")
+
+
+class DDiffPG(OffPolicyAlgorithm):
+    """
+    Deep Diffusion Policy Gradient (DDiffPG): learns several ways to solve one task.
+
+    Paper: https://arxiv.org/abs/2406.00681 (Li et al., NeurIPS 2024). How this implementation differs from it is listed in
+    ``docs/ddiffpg.md``. The defaults suit a laptop; the paper's own numbers are in ``zoo_hyperparams/ddiffpg.yml``.
+
+    :param policy: ``"DiffusionPolicy"``, ``"MlpPolicy"`` (the same), ``"MultiInputPolicy"`` (dict observations) or a class
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param learning_rate: Learning rate of the diffusion policy, a float or a function of the remaining progress (from 1 to 0)
+    :param buffer_size: Capacity of the replay buffer in transitions, over all environments
+    :param learning_starts: Steps of random actions before learning starts
+    :param batch_size: Transitions per update, split evenly over the exploratory group and the modes
+    :param tau: Soft update coefficient of the target critics
+    :param gamma: Discount factor
+    :param train_freq: Update the model every ``train_freq`` steps (of all environments), or a tuple with the unit
+    :param gradient_steps: Updates after each rollout; -1: as many as transitions were collected
+    :param action_noise: Exploration noise; None: Gaussian, its standard deviation drawn per episode from [.05, .6]
+    :param replay_buffer_class: ``ModeReplayBuffer`` or a subclass of it
+    :param replay_buffer_kwargs: Further keyword arguments of the replay buffer
+    :param optimize_memory_usage: Not supported
+    :param n_steps: Not supported: see ``mode_n_steps`` and ``exploration_n_steps``
+    :param qf_learning_rate: Learning rate of the critics, like ``learning_rate``; the same as it when None
+    :param n_diffusion_steps: Number of diffusion steps T
+    :param action_lr: Step size eta of the ascent on target actions
+    :param n_action_gradient_steps: Number of ascent steps K per update
+    :param action_optimizer: ``"adam"``, ``"normalized"`` or ``"sgd"`` (the paper's equation), see ``target_actions.ascend``
+    :param n_critics: Critics per mode, the minimum over them is used
+    :param n_atoms: Atoms of the critics' value distribution (C51); 1 for scalar critics
+    :param v_min: Lower end of the values' support
+    :param v_max: Upper end of the support of the modes' critics
+    :param exploration_v_max: Upper end of the support of the exploratory critics (lower end: minus that when
+        ``normalize_intrinsic``); ``v_max`` when None
+    :param reward_scale: Factor on the environment's reward
+    :param mode_n_steps: Length of the multi-step returns of the modes' critics (uncorrected)
+    :param exploration_n_steps: The same for the exploratory critics
+    :param target_policy_noise: Standard deviation of the noise on the actions in the Bellman target
+    :param target_noise_clip: Limit of that noise
+    :param backup_embedding: What the policy in a mode's Bellman target is conditioned on: ``"mode"``, its own embedding, or
+        ``"masked"``, the same embedding masked as in the policy's training
+    :param recluster_freq: Rollouts between two re-clusterings
+    :param distance_threshold: Distance (in units of the mode features) above which two groups of trajectories are
+        different modes; None: an automatic rule
+    :param linkage: Linkage of the hierarchical clustering, as in ``scipy.cluster.hierarchy.linkage``
+    :param max_modes: Most modes at a time; 1 turns clustering off
+    :param min_mode_size: Fewest goal-reached trajectories that make a mode
+    :param max_successes_per_mode: Newest goal-reached trajectories that train a mode
+    :param max_failures_per_mode: Newest failed trajectories that train a mode
+    :param mode_embedding_dim: Size of a mode embedding
+    :param mode_mask_prob: Probability p with which a mode's embedding is masked when the policy is trained
+    :param mode_features: In which part of the observation modes differ: indices, a key, or a callable on batches of
+        observations. None: what the environment declares as ``mode_features``, ``achieved_goal`` of a dict observation,
+        else the whole observation, standardised
+    :param success_key: Key of ``info`` that marks a success, see ``ModeReplayBuffer``
+    :param exploration_share: Share of episodes that explore, a float or a function of the remaining progress. None:
+        ``1 / (M + 1)`` until ``exploration_fraction`` of the training, then 0; always 1 while there is no mode
+    :param exploration_fraction: Part of the training that explores, when ``exploration_share`` is None
+    :param novelty: ``"rnd"``, ``"counts"``, or a class with the methods of ``RandomNetworkDistillation``
+    :param novelty_kwargs: Further keyword arguments of the novelty measure
+    :param novelty_scale: The factor alpha of NovelD
+    :param intrinsic_coef: Factor c on the intrinsic reward
+    :param mode_intrinsic_coef: Factor on the intrinsic reward that is added to the modes' rewards
+    :param normalize_intrinsic: Whether the intrinsic reward is standardised by its running mean and deviation
+    :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
+        copies of the exploratory ones
+    :param max_grad_norm: Largest gradient norm of the policy and of each mode's critics
+    :param stats_window_size: Window size for the rollout logging
+    :param tensorboard_log: The log location for tensorboard (if None, no logging)
+    :param policy_kwargs: Additional arguments of the policy, see ``DiffusionPolicy``
+    :param verbose: 0: no output, 1: info messages and what became of the modes, 2: debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device on which the code should run; "auto" uses the GPU if possible
+    :param _init_setup_model: Whether to build the networks at the creation of the instance
+    :raises ValueError: If an argument is out of its range, naming it
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "DiffusionPolicy": DiffusionPolicy,
+        "MlpPolicy": DiffusionPolicy,
+        "MultiInputPolicy": DiffusionPolicy,
+    }
+    policy: DiffusionPolicy
+    actor: DiffusionActor
+    replay_buffer: ModeReplayBuffer
+
+    def __init__(
+        self,
+        policy: str | type[DiffusionPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 500_000,
+        learning_starts: int = 1_000,
+        batch_size: int = 256,
+        tau: float = 0.05,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ModeReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        qf_learning_rate: float | Schedule | None = None,
+        n_diffusion_steps: int = 5,
+        action_lr: float = 0.3,
+        n_action_gradient_steps: int = 1,
+        action_optimizer: str = "adam",
+        n_critics: int = 2,
+        n_atoms: int = 51,
+        v_min: float = 0.0,
+        v_max: float = 5.0,
+        exploration_v_max: float | None = None,
+        reward_scale: float = 1.0,
+        mode_n_steps: int = 5,
+        exploration_n_steps: int = 1,
+        target_policy_noise: float = 0.8,
+        target_noise_clip: float = 0.2,
+        backup_embedding: str = "mode",
+        recluster_freq: int = 25,
+        distance_threshold: float | None = None,
+        linkage: str = "average",
+        max_modes: int = 10,
+        min_mode_size: int = 5,
+        max_successes_per_mode: int = 40,
+        max_failures_per_mode: int = 20,
+        mode_embedding_dim: int = 5,
+        mode_mask_prob: float = 0.5,
+        mode_features: Any = None,
+        success_key: str | None = None,
+        exploration_share: float | Schedule | None = None,
+        exploration_fraction: float = 0.7,
+        novelty: str | type = "counts",
+        novelty_kwargs: dict[str, Any] | None = None,
+        novelty_scale: float = 0.5,
+        intrinsic_coef: float = 0.1,
+        mode_intrinsic_coef: float = 0.0,
+        normalize_intrinsic: bool = True,
+        reset_new_critics: bool = True,
+        max_grad_norm: float = 1.0,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+        )
+        self.qf_learning_rate = qf_learning_rate
+        self.n_diffusion_steps = n_diffusion_steps
+        self.action_lr = action_lr
+        self.n_action_gradient_steps = n_action_gradient_steps
+        self.action_optimizer = action_optimizer
+        self.n_critics = n_critics
+        self.n_atoms = n_atoms
+        self.v_min = v_min
+        self.v_max = v_max
+        self.exploration_v_max = exploration_v_max
+        self.reward_scale = reward_scale
+        self.mode_n_steps = mode_n_steps
+        self.exploration_n_steps = exploration_n_steps
+        self.target_policy_noise = target_policy_noise
+        self.target_noise_clip = target_noise_clip
+        self.backup_embedding = backup_embedding
+        self.recluster_freq = recluster_freq
+        self.distance_threshold = distance_threshold
+        self.linkage = linkage
+        self.max_modes = max_modes
+        self.min_mode_size = min_mode_size
+        self.max_successes_per_mode = max_successes_per_mode
+        self.max_failures_per_mode = max_failures_per_mode
+        self.mode_embedding_dim = mode_embedding_dim
+        self.mode_mask_prob = mode_mask_prob
+        self.mode_features = mode_features
+        self.success_key = success_key
+        self.exploration_share = exploration_share
+        self.exploration_fraction = exploration_fraction
+        self.novelty = novelty
+        self.novelty_kwargs = novelty_kwargs
+        self.novelty_scale = novelty_scale
+        self.intrinsic_coef = intrinsic_coef
+        self.mode_intrinsic_coef = mode_intrinsic_coef
+        self.normalize_intrinsic = normalize_intrinsic
+        self.reset_new_critics = reset_new_critics
+        self.max_grad_norm = max_grad_norm
+
+        # What a run remembers beside its networks; all of it is saved
+        self.n_rollouts = 0
+        self._modes: list[Mode] = []
+        self._next_mode_number = 0
+        self._env_groups = np.zeros(0, dtype=np.int64)  # the row of the embedding table that drives each environment
+        self._rotation = 0
+        self._resolved_features: Any = None
+        self._warned_support = False
+
+        if _init_setup_model:
+            self._setup_model()
+
+    # ------------------------------------------------------------------ set-up
+
+    def _setup_model(self) -> None:
+        check_arguments(self)
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = ModeReplayBuffer
+        self._resolve_mode_features()
+        given = self.policy_kwargs, self.replay_buffer_kwargs
+        # Not stored in the model: what the user gave is what ``load`` compares and ``save`` keeps
+        self.policy_kwargs = {
+            "n_modes": len(self._modes),
+            "n_diffusion_steps": self.n_diffusion_steps,
+            "mode_embedding_dim": self.mode_embedding_dim,
+            "n_critics": self.n_critics,
+            "n_atoms": self.n_atoms,
+            "support": (self.v_min, self.v_max),
+            "exploration_support": self._exploration_support(),
+            **self.policy_kwargs,
+        }
+        self.replay_buffer_kwargs = {
+            "mode_features": self._resolved_features,
+            "success_key": self.success_key,
+            "max_successes_per_mode": self.max_successes_per_mode,
+            "max_failures_per_mode": self.max_failures_per_mode,
+            **self.replay_buffer_kwargs,
+        }
+        try:
+            super()._setup_model()
+        finally:
+            self.policy_kwargs, self.replay_buffer_kwargs = given
+        if self.action_noise is None:
+            self.action_noise = SpreadNormalActionNoise(self.n_envs, int(np.prod(self.action_space.shape or (1,))))
+        measure = NOVELTY_MEASURES[self.novelty] if isinstance(self.novelty, str) else self.novelty
+        self.novelty_model: Any = measure(
+            self.replay_buffer.features.dim, self.policy.actor.features_dim, **(self.novelty_kwargs or {})
+        ).to(self.device)
+        self.intrinsic_moments = RunningMoments(1, max_count=100_000).to(self.device)
+        self._qf_schedule = self.lr_schedule if self.qf_learning_rate is None else FloatSchedule(self.qf_learning_rate)
+        self._create_aliases()
+
+    def _exploration_support(self) -> tuple[float, float]:
+        upper = self.v_max if self.exploration_v_max is None else self.exploration_v_max
+        # A standardised reward is negative where nothing is new
+        return (-upper if self.normalize_intrinsic else min(0.0, self.v_min), upper)
+
+    def _resolve_mode_features(self) -> None:
+        if self.mode_features is not None:
+            self._resolved_features = self.mode_features
+        elif self.env is not None:
+            try:
+                self._resolved_features = self.env.get_attr("mode_features", indices=0)[0]
+            except AttributeError:
+                is_goal_env = (
+                    isinstance(self.observation_space, spaces.Dict) and "achieved_goal" in self.observation_space.spaces
+                )
+                self._resolved_features = "achieved_goal" if is_goal_env else None
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+
+    @property
+    def critics(self) -> ModeCritics:
+        """The critics of all groups, see ``critics.ModeCritics``."""
+        return self.policy.critics
+
+    @property
+    def modes(self) -> ModeTable:
+        """The modes discovered so far: iterate, index by name or number, or print."""
+        embeddings = self.policy.mode_embeddings[1:].cpu().numpy()
+        for mode, embedding in zip(self._modes, embeddings, strict=True):
+            mode.embedding = embedding
+        return ModeTable(self._modes)
+
+    # ------------------------------------------------------------------ learning
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """
+        Algorithm 1 of the paper, lines 9 to 21.
+
+        :param gradient_steps: Number of updates
+        :param batch_size: Transitions per update, over all groups
+        """
+        self.policy.set_training_mode(True)
+        self._update_learning_rates()
+        metrics: dict[str, list[th.Tensor]] = defaultdict(list)
+        for _ in range(gradient_steps):
+            # Sample one batch per mode, and one for the exploratory group
+            batch = self.replay_buffer.sample_modes(
+                batch_size, self.gamma, self.exploration_n_steps, self.mode_n_steps, env=self._vec_normalize_env
+            )
+            rewards = self._rewards(batch, metrics)
+            # Update each critic with the Bellman equation on its own batch
+            metrics["critic_loss"].append(self._update_critics(batch, rewards))
+            # Gradient ascent on the target actions, which return to the buffer
+            target_actions = self._improve_target_actions(batch)
+            metrics["target_action_shift"].append((target_actions - batch.target_actions).abs().mean())
+            # Concatenate all batches and update the diffusion policy
+            metrics["actor_loss"].append(self._update_actor(batch, target_actions))
+            self._update_targets()
+        self._n_updates += gradient_steps
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, values in metrics.items():
+            self.logger.record(f"train/{name}", th.stack(values).mean().item())
+
+    def _rewards(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> th.Tensor:
+        """Intrinsic reward for the exploratory group, the environment's (and some intrinsic) for the modes, [G, n]."""
+        everywhere = self.mode_intrinsic_coef != 0.0
+        windows = batch.windows if everywhere else batch.windows[:1, :, : self.exploration_n_steps]
+        intrinsic = self._intrinsic_rewards(windows, metrics)
+        rewards = self.reward_scale * batch.rewards
+        if everywhere:
+            rewards = rewards + self.mode_intrinsic_coef * intrinsic
+        rewards[EXPLORATORY_GROUP] = intrinsic[EXPLORATORY_GROUP]
+        return rewards
+
+    def _intrinsic_rewards(self, windows: np.ndarray, metrics: dict[str, list[th.Tensor]]) -> th.Tensor:
+        """
+        Discounted NovelD rewards over windows of consecutive rows, followed by one step of the novelty measure.
+
+        :param windows: Rows, [G, n, n_steps], -1 beyond a window's end
+        :param metrics: Where to note the mean and the loss
+        :return: [G, n]
+        """
+        rows = windows.clip(min=0).ravel()
+        inputs = [self._novelty_inputs(obs) for obs in self.replay_buffer.read_observations(rows)]
+        now, then = (self.novelty_model.novelty(*each) for each in inputs)
+        reward = noveld_reward(now, then, self.novelty_scale)
+        metrics["intrinsic_reward"].append(reward.mean())
+        if self.normalize_intrinsic:
+            self.intrinsic_moments.update(reward[:, None])
+            # Without limits one surprising state would dominate the values for long
+            reward = self.intrinsic_moments.standardize(reward[:, None])[:, 0].clamp(-2.0, 8.0)
+        if self.novelty_model.optimizer is not None:
+            metrics["novelty_loss"].append(self.novelty_model.update(*inputs[1]))
+        steps = th.arange(windows.shape[-1], device=self.device)
+        weights = self.intrinsic_coef * self.gamma**steps * th.as_tensor(windows >= 0, device=self.device)
+        return (reward.view(windows.shape) * weights).sum(dim=-1).float()
+
+    def _novelty_inputs(self, obs: Any) -> tuple[th.Tensor, th.Tensor]:
+        """Positions [N, position_dim] and scaled features [N, features_dim] of raw observations."""
+        positions = th.as_tensor(self.replay_buffer.features(obs), device=self.device)
+        if not getattr(self.novelty_model, "with_observation", False):
+            return positions, positions
+        if self._vec_normalize_env is not None:
+            obs = self._vec_normalize_env.normalize_obs(obs)
+        with th.no_grad():
+            obs = (
+                {key: th.as_tensor(value, device=self.device) for key, value in obs.items()}
+                if isinstance(obs, dict)
+                else (th.as_tensor(obs, device=self.device))
+            )
+            return positions, self.actor.extract_features(obs, self.actor.features_extractor)
+
+    def _row_embeddings(self, batch: ModeBatch, masked: bool) -> th.Tensor:
+        """Embedding of every row's group, [G * n, mode_embedding_dim]; masked with probability p, exploration never."""
+        n_groups, n = batch.rows.shape
+        embeddings = self.policy.mode_embeddings[:, None].expand(-1, n, -1)
+        if masked:
+            keep = (th.rand(n_groups, n, 1, device=self.device) >= self.mode_mask_prob).to(embeddings.dtype)
+            keep[EXPLORATORY_GROUP] = 1.0
+            embeddings = embeddings * keep
+        return embeddings.reshape(n_groups * n, -1)
+
+    def _update_critics(self, batch: ModeBatch, rewards: th.Tensor) -> th.Tensor:
+        policy, shape = self.policy, batch.actions.shape
+        with th.no_grad():
+            embeddings = self._row_embeddings(batch, masked=self.backup_embedding == "masked")
+            next_actions = self.actor(batch.next_observations, embeddings=embeddings)
+            noise = (th.randn_like(next_actions) * self.target_policy_noise).clamp(
+                -self.target_noise_clip, self.target_noise_clip
+            )
+            next_actions = (next_actions + noise).clamp(-1.0, 1.0).view(shape)
+            next_features = policy.critic_features(batch.next_observations, target=True)
+            targets = policy.critics_target.bellman_target(next_features, next_actions, rewards, batch.discounts)
+        losses = policy.critics.loss(policy.critic_features(batch.observations), batch.actions, targets)
+        policy.critics.optimizer.zero_grad(set_to_none=True)
+        (losses * batch.active).sum().backward()
+        policy.critics.clip_gradients(self.max_grad_norm)
+        policy.critics.optimizer.step()
+        return losses.detach().mean()
+
+    def _improve_target_actions(self, batch: ModeBatch) -> th.Tensor:
+        """a_target <- a_target + eta * grad_a Q_i(s, a_target), K times, written back to the buffer. [G, n, action_dim]"""
+        with th.no_grad():
+            features = self.policy.critic_features(batch.observations)
+        target_actions = ascend(
+            lambda actions: self.policy.critics.action_gradient(features, actions),
+            batch.target_actions,
+            learning_rate=self.action_lr,
+            n_steps=self.n_action_gradient_steps,
+            optimizer=self.action_optimizer,
+        )
+        self.replay_buffer.store_target_actions(batch, target_actions)
+        return target_actions
+
+    def _update_actor(self, batch: ModeBatch, target_actions: th.Tensor) -> th.Tensor:
+        condition = self.actor.condition(batch.observations, self._row_embeddings(batch, masked=True))
+        weights = batch.active.float()[:, None].expand(batch.rows.shape).reshape(-1)
+        loss = self.actor.diffusion.loss(target_actions.flatten(0, 1), condition, weights=weights)
+        self.actor.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        th.nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
+        self.actor.optimizer.step()
+        return loss.detach()
+
+    def _update_targets(self) -> None:
+        policy = self.policy
+        polyak_update(policy.critics.parameters(), policy.critics_target.parameters(), self.tau)
+        polyak_update(
+            policy.critic_features_extractor.parameters(), policy.critic_features_extractor_target.parameters(), self.tau
+        )
+        polyak_update(policy.critic_features_extractor.buffers(), policy.critic_features_extractor_target.buffers(), 1.0)
+
+    def _update_learning_rates(self) -> None:
+        progress = self._current_progress_remaining
+        for name, optimizer, schedule in (
+            ("learning_rate", self.actor.optimizer, self.lr_schedule),
+            ("qf_learning_rate", self.policy.critics.optimizer, self._qf_schedule),
+        ):
+            self.logger.record(f"train/{name}", schedule(progress))
+            update_learning_rate(optimizer, schedule(progress))
+
+    # ------------------------------------------------------------------ modes
+
+    def recluster(self) -> list[str]:
+        """
+        Algorithm 2 of the paper: cluster the goal-reached trajectories, let the new modes inherit from the old ones, and
+        assign the failed trajectories.
+
+        :return: One entry for every mode that was born, split, merged or retired
+        """
+        started = time.perf_counter()
+        found = find_modes(self.replay_buffer, self._modes, self._cluster, self.min_mode_size)
+        if found is None:
+            return []
+        parents, kept = found.inheritance.parents, found.inheritance.kept
+        self.replay_buffer.assign_modes(found.successes, found.labels, found.failures, found.failure_labels, parents)
+        self.policy.inherit(parents, kept, self.reset_new_critics)
+        old_names = [mode.name for mode in self._modes]
+        self._modes, events, self._next_mode_number = succeed(
+            self._modes, found.inheritance, self.num_timesteps, self._next_mode_number
+        )
+        self._follow_names(old_names)
+        found.describe(self._modes, self.replay_buffer)
+        self.logger.record("modes/n_modes", len(self._modes))
+        for mode in self._modes:
+            self.logger.record(f"modes/{mode.name}/n_trajectories", mode.n_trajectories)
+            self.logger.record(f"modes/{mode.name}/success_rate", mode.success_rate)
+        self.logger.record("time/recluster", time.perf_counter() - started)
+        return events
+
+    def _cluster(self, distances: np.ndarray) -> np.ndarray:
+        if self.max_modes == 1:
+            return np.zeros(len(distances), dtype=int)  # clustering off: whatever reaches the goal is the one mode
+        return cluster(distances, self.distance_threshold, self.linkage, self.max_modes, self.min_mode_size)
+
+    def _follow_names(self, old_names: list[str]) -> None:
+        """Environments go on with the mode they follow; its index may have changed, or it is gone."""
+        names = [mode.name for mode in self._modes]
+        new_group = {old + 1: names.index(name) + 1 if name in names else UNCONDITIONED for old, name in enumerate(old_names)}
+        self._env_groups = np.array([new_group.get(group, group) for group in self._env_groups.tolist()], dtype=np.int64)
+
+    # ------------------------------------------------------------------ acting
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+        mode: str | int | list[str | int] | np.ndarray | None = None,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Actions for one observation or a batch of them.
+
+        :param observation: The observation(s)
+        :param state: What the previous call returned: the mode that every environment follows
+        :param episode_start: Which environments begin an episode
+        :param deterministic: Zero initial latent and no sampling noise: the same call returns the same action
+        :param mode: Name or index of the mode to follow, or one for each observation. None: a mode is drawn for each episode
+            and kept through it by ``state`` and ``episode_start``; without those, the zero embedding, which leaves the
+            choice to the policy at every step
+        :return: The actions and the state for the next call
+        :raises ValueError: If there is no such mode
+        """
+        indices: int | np.ndarray | None = None
+        if mode is not None:
+            table = ModeTable(self._modes)
+            single = isinstance(mode, (str, int, np.integer))
+            indices = table.index(mode) if single else np.array([table.index(each) for each in mode])  # type: ignore[arg-type, union-attr]
+        return self.policy.predict(observation, state, episode_start, deterministic, mode=indices)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        assert self._last_obs is not None, "self._last_obs was not set"
+        shape = (n_envs, *self.action_space.shape)  # type: ignore[misc]
+        if self.num_timesteps < learning_starts:
+            scaled_action = np.random.uniform(-1.0, 1.0, size=shape).astype(np.float32)
+        else:
+            action, _ = self.policy.predict(self._last_obs, group=self._env_groups)
+            scaled_action = self.policy.scale_action(action)
+            if action_noise is not None:
+                scaled_action = np.clip(scaled_action + action_noise().reshape(shape), -1.0, 1.0)
+        return self.policy.unscale_action(scaled_action), scaled_action
+
+    def _draw_group(self) -> int:
+        """What drives an environment through its next episode: exploration, or the modes and the zero embedding in turn."""
+        if not self._modes or np.random.rand() < self._exploration_share():
+            return EXPLORATORY_GROUP
+        self._rotation += 1
+        turn = self._rotation % (len(self._modes) + 1)
+        return UNCONDITIONED if turn == 0 else turn
+
+    def _exploration_share(self) -> float:
+        progress_remaining = self._current_progress_remaining
+        if self.exploration_share is None:
+            return 1 / (len(self._modes) + 1) if 1 - progress_remaining < self.exploration_fraction else 0.0
+        return float(FloatSchedule(self.exploration_share)(progress_remaining))
+
+    def _store_transition(self, replay_buffer: ModeReplayBuffer, *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
+        super()._store_transition(replay_buffer, *args, **kwargs)
+        positions = th.as_tensor(replay_buffer.last_positions(), device=self.device)
+        self.novelty_model.observe(positions)
+        for env, trajectory in replay_buffer.just_finished:
+            group = int(self._env_groups[env])
+            if group > EXPLORATORY_GROUP:
+                self._modes[group - 1].outcomes.append(trajectory.success)
+            self._warn_outside_support(trajectory)
+            self._env_groups[env] = self._draw_group()
+
+    def _warn_outside_support(self, trajectory: Trajectory) -> None:
+        """Once: values that the critics cannot represent make all actions look alike."""
+        if self._warned_support:
+            return
+        rewards = self.reward_scale * self.replay_buffer.rewards[trajectory.rows]
+        returns = lfilter([1.0], [1.0, -self.gamma], rewards[::-1])
+        if returns.max() > self.v_max + 1e-6 or returns.min() < self.v_min - 1e-6:
+            self._warned_support = True
+            warnings.warn(
+                f"A discounted return between {returns.min():.4g} and {returns.max():.4g} leaves the critics' support "
+                f"[v_min={self.v_min}, v_max={self.v_max}] and is clipped: adapt v_min, v_max or reward_scale"
+            )
+
+    # ------------------------------------------------------------------ a run's beginning and end
+
+    def learn(
+        self: SelfDDiffPG,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 100,
+        tb_log_name: str = "DDiffPG",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfDDiffPG:
+        """
+        Train the model. See SB3's ``learn``; ``log_interval`` counts episodes of all environments.
+        """
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        assert self.env is not None, "You must set the environment before calling learn()"
+        self._check_buffer(self.env)
+        # Denormal numbers in Adam's moments slow a small update down by half
+        th.set_flush_denormal(True)
+        if reset_num_timesteps or self._last_obs is None:
+            self.replay_buffer.drop_unfinished_episodes()
+            self._env_groups = np.array([self._draw_group() for _ in range(self.n_envs)], dtype=np.int64)
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    def _check_buffer(self, env: VecEnv) -> None:
+        """The episodes in progress must fit, or hours later there would be nothing to evict."""
+        if self.replay_buffer.n_envs != self.n_envs:
+            raise ValueError(f"The replay buffer was made for {self.replay_buffer.n_envs} environment(s), got {self.n_envs}")
+        try:
+            limit = getattr(env.get_attr("spec", indices=0)[0], "max_episode_steps", None)
+        except AttributeError:
+            return
+        if limit is not None and self.replay_buffer.buffer_size < limit * self.n_envs:
+            raise ValueError(
+                f"buffer_size={self.replay_buffer.buffer_size} is smaller than one episode of every environment: "
+                f"{self.n_envs} x {limit} steps"
+            )
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """
+        See SB3. A callback that stops the training makes SB3 drop the last transition (its issue 2056): the next ``learn``
+        then resets the environments, or the running trajectories would have a gap.
+        """
+        rollout = super().collect_rollouts(*args, **kwargs)
+        if not rollout.continue_training:
+            self._last_obs = None
+        return rollout
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        callbacks = callback if isinstance(callback, list) else [callback]
+        callbacks = [each if isinstance(each, BaseCallback) else ConvertCallback(each) for each in callbacks]
+        if not any(_contains_clustering(each) for each in callbacks):
+            # First, so that the others see fresh modes
+            callbacks.insert(0, ClusteringCallback())
+        return super()._init_callback(callbacks, progress_bar)
+
+    # ------------------------------------------------------------------ saving
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names = ["policy", "actor.optimizer", "policy.critics.optimizer", "novelty_model", "intrinsic_moments"]
+        if self.novelty_model.optimizer is not None:
+            names.append("novelty_model.optimizer")
+        return names, []
+
+    def set_parameters(
+        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """
+        See SB3. The number of modes follows the given parameters.
+        """
+        params: Any = load_path_or_dict
+        if not isinstance(params, dict):
+            _, params, _ = load_from_zip_file(params, device=device, load_data=False)
+        embeddings = params.get("policy", {}).get("mode_embeddings")
+        if embeddings is not None:
+            self.policy.resize(len(embeddings) - 1)
+        super().set_parameters(params, exact_match, device)
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a replay buffer with its trajectories, clusters, target actions and distances.
+
+        :param path: Path to the pickled replay buffer
+        :param truncate_last_traj: Whether the next ``learn`` resets the environments and drops the episodes in progress
+        :raises ValueError: If it is no ``ModeReplayBuffer``, or holds other modes than the model
+        """
+        previous = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded = self.replay_buffer
+        problem = None
+        if not isinstance(loaded, ModeReplayBuffer):
+            problem = f"is a {type(loaded).__name__}, not a ModeReplayBuffer"
+        elif len(loaded.mode_rows) != len(self._modes):
+            problem = f"holds {len(loaded.mode_rows)} modes, the model {len(self._modes)}: save and load both together"
+        if problem is not None:
+            self.replay_buffer = previous
+            raise ValueError(f"The replay buffer {path} {problem}")
+        if truncate_last_traj:
+            self._last_obs = None
+
+
+def _contains_clustering(callback: BaseCallback) -> bool:
+    if isinstance(callback, ClusteringCallback):
+        return True
+    children = getattr(callback, "callbacks", []) or [getattr(callback, "callback", None)]
+    return any(_contains_clustering(child) for child in children if isinstance(child, BaseCallback))

@@ -1,0 +1,75 @@
+"""Complete episodes of a trained model: what each came to, and on which route."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_ddiffpg.features import ModeFeatures
+from sb3_ddiffpg.trajectories import SUCCESS_KEYS
+
+
+@dataclass
+class EpisodeResult:
+    """
+    One complete episode.
+
+    :param success: Whether the goal was reached
+    :param length: Number of steps
+    :param episode_return: Sum of rewards
+    :param label: Ground-truth mode, ``info["mode"]`` of the last step, None if the environment gives none
+    :param path: Mode features along the episode, terminal state included, shape [length + 1, dim]
+    """
+
+    success: bool
+    length: int
+    episode_return: float
+    label: str | None
+    path: np.ndarray
+
+
+def run_episodes(
+    model: Any, env: VecEnv, n_episodes: int, mode: str | int | None = None, deterministic: bool = False
+) -> list[EpisodeResult]:
+    """
+    Run complete episodes. Every environment contributes its first ones, the same number (give or take one): taking
+    whichever end first would favour short episodes.
+
+    :param model: An SB3 model; if it has modes, ``mode`` commands one
+    :param env: Vectorised environment; its episodes should start where modes are to be compared
+    :param n_episodes: Number of episodes
+    :param mode: Mode to command; None: the model draws one for each episode, if it has modes
+    :param deterministic: Passed to ``predict``
+    :return: ``n_episodes`` results, ordered by environment
+    """
+    share = np.array([n_episodes // env.num_envs + (i < n_episodes % env.num_envs) for i in range(env.num_envs)])
+    features = ModeFeatures(env.observation_space, getattr(model, "_resolved_features", None))
+    command = {} if mode is None else {"mode": mode}
+    results: list[list[EpisodeResult]] = [[] for _ in range(env.num_envs)]
+    obs, state, starts = env.reset(), None, np.ones(env.num_envs, dtype=bool)
+    paths: list[list[np.ndarray]] = [[position] for position in features(_original(env, obs))]
+    returns = np.zeros(env.num_envs)
+    while any(len(done) < wanted for done, wanted in zip(results, share, strict=True)):
+        actions, state = model.predict(obs, state=state, episode_start=starts, deterministic=deterministic, **command)
+        obs, rewards, starts, infos = env.step(actions)
+        returns += rewards
+        positions = features(_original(env, obs))
+        for i in range(env.num_envs):
+            if not starts[i]:
+                paths[i].append(positions[i])
+                continue
+            terminal = infos[i].get("terminal_observation")
+            if terminal is not None:
+                batch = {key: value[None] for key, value in terminal.items()} if isinstance(terminal, dict) else terminal[None]
+                paths[i].append(features(batch)[0])
+            success = next((bool(infos[i][key]) for key in SUCCESS_KEYS if key in infos[i]), False)
+            episode = EpisodeResult(success, len(paths[i]) - 1, float(returns[i]), infos[i].get("mode"), np.stack(paths[i]))
+            results[i].append(episode)
+            paths[i], returns[i] = [positions[i]], 0.0
+    return [episode for done, wanted in zip(results, share, strict=True) for episode in done[:wanted]]
+
+
+def _original(env: VecEnv, obs: Any) -> Any:
+    """Positions are compared in metres, whatever a normalising wrapper shows the networks."""
+    return env.get_original_obs() if hasattr(env, "get_original_obs") else obs

@@ -1,0 +1,97 @@
+"""What is seen of an observation: the mode features (clustering, novelty) and the scaled features (networks)."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+Observation = np.ndarray | dict[str, np.ndarray]
+
+# Bounds beyond this say "finite", not "this is the range"
+LARGEST_USEFUL_BOUND = 1e4
+
+
+class ScaledFlattenExtractor(BaseFeaturesExtractor):
+    """
+    Flattens the observation and maps every component with declared finite bounds to [-1, 1]; others pass unchanged.
+    Positions of a maze reach 16 m: unscaled they would saturate the first layer.
+
+    :param observation_space: Any space but a dict
+    """
+
+    offset: th.Tensor
+    scale: th.Tensor
+
+    def __init__(self, observation_space: spaces.Space) -> None:
+        super().__init__(observation_space, get_flattened_obs_dim(observation_space))
+        offset, scale = np.zeros(self.features_dim), np.ones(self.features_dim)
+        if isinstance(observation_space, spaces.Box) and not is_image_space(observation_space):
+            low, high = observation_space.low.ravel().astype(np.float64), observation_space.high.ravel().astype(np.float64)
+            bounded = (np.abs(low) < LARGEST_USEFUL_BOUND) & (np.abs(high) < LARGEST_USEFUL_BOUND) & (low < high)
+            offset[bounded] = (low + high)[bounded] / 2
+            scale[bounded] = 2 / (high - low)[bounded]
+        self.register_buffer("offset", th.as_tensor(offset, dtype=th.float32), persistent=False)
+        self.register_buffer("scale", th.as_tensor(scale, dtype=th.float32), persistent=False)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: Shape [N, *observation_space.shape]
+        :return: Shape [N, features_dim]
+        """
+        return (observations.flatten(1) - self.offset) * self.scale
+
+
+class ModeFeatures:
+    """
+    Selects the part of an observation in which modes differ, usually a position in metres.
+
+    :param observation_space: Observation space of the environment
+    :param selection: Indices of a flat observation, a key of a dict observation, a callable that maps a batch of
+        observations to an array [N, d], or None for the whole observation
+    :raises ValueError: If the selection does not fit the observation space
+    """
+
+    def __init__(
+        self, observation_space: spaces.Space, selection: Sequence[int] | np.ndarray | str | Callable | None = None
+    ) -> None:
+        self.selection: Any = selection
+        self.whole_observation = selection is None
+        if isinstance(selection, str):
+            keys = list(observation_space.spaces) if isinstance(observation_space, spaces.Dict) else []
+            if selection not in keys:
+                raise ValueError(f"mode_features={selection!r} is not a key of the observation; keys: {keys}")
+        elif selection is not None and not callable(selection):
+            indices = np.asarray(selection)
+            if isinstance(observation_space, spaces.Dict):
+                raise ValueError("mode_features must be a key or a callable for dict observations, got indices")
+            size = int(np.prod(observation_space.shape or (1,)))
+            if indices.ndim != 1 or indices.size == 0 or indices.dtype.kind not in "iu":
+                raise ValueError(f"mode_features must be a non-empty list of indices, a key or a callable, got {selection!r}")
+            if indices.min() < 0 or indices.max() >= size:
+                raise ValueError(f"mode_features={indices.tolist()} exceeds the observation's {size} components")
+            self.selection = indices
+        sample = observation_space.sample()
+        batch = {key: value[None] for key, value in sample.items()} if isinstance(sample, dict) else np.asarray(sample)[None]
+        features = self(batch)
+        if features.ndim != 2 or features.shape[0] != 1:
+            raise ValueError(f"mode_features must map N observations to an array [N, d], got shape {features.shape} for N=1")
+        self.dim = features.shape[1]
+
+    def __call__(self, observations: Observation) -> np.ndarray:
+        """
+        :param observations: Batch of N observations
+        :return: Shape [N, dim], float32
+        """
+        if callable(self.selection):
+            features = np.asarray(self.selection(observations))
+        elif isinstance(observations, dict):
+            keys = sorted(observations) if self.selection is None else [self.selection]
+            features = np.concatenate([observations[key].reshape(len(observations[key]), -1) for key in keys], axis=1)
+        else:
+            flat = observations.reshape(len(observations), -1)
+            features = flat if self.selection is None else flat[:, self.selection]
+        return features.astype(np.float32)

@@ -1,0 +1,122 @@
+"""Who is who among the modes: names that survive re-clustering, statistics, and the table behind ``model.modes``."""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sb3_ddiffpg.clustering import Inheritance
+
+
+@dataclass
+class Mode:
+    """
+    One discovered way to solve the task.
+
+    :param name: Kept for life, through re-clusterings, saving and loading
+    :param born_at: Environment steps when it was discovered
+    :param n_trajectories: Goal-reached trajectories that train it
+    :param mean_length: Their mean length, in environment steps
+    :param mean_return: Their mean undiscounted return
+    :param representative: Mode features along the most central of them (the medoid), shape [length + 1, dim]
+    :param outcomes: Success of the latest training episodes that were commanded to this mode
+    :param embedding: The vector that commands it; filled in by ``model.modes``, owned by the policy
+    """
+
+    name: str
+    born_at: int
+    n_trajectories: int = 0
+    mean_length: float = float("nan")
+    mean_return: float = float("nan")
+    representative: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32), repr=False)
+    outcomes: deque[bool] = field(default_factory=lambda: deque(maxlen=100), repr=False)
+    embedding: np.ndarray | None = field(default=None, repr=False)
+
+    @property
+    def success_rate(self) -> float:
+        """Share of successes among the latest (at most 100) training episodes commanded to it, noise included; or NaN."""
+        return float(np.mean(self.outcomes)) if self.outcomes else float("nan")
+
+
+class ModeTable(Sequence[Mode]):
+    """
+    The modes that a model holds. Iterate over it, index it by number or name, or print it.
+
+    :param modes: In the order of their indices
+    """
+
+    def __init__(self, modes: Sequence[Mode] = ()) -> None:
+        self._modes = list(modes)
+
+    @property
+    def names(self) -> list[str]:
+        """Names in the order of the indices."""
+        return [mode.name for mode in self._modes]
+
+    def __len__(self) -> int:
+        return len(self._modes)
+
+    def __iter__(self) -> Iterator[Mode]:
+        return iter(self._modes)
+
+    def __getitem__(self, key):
+        """
+        :param key: Index, slice or name
+        """
+        return self._modes[self.index(key) if isinstance(key, str) else key]
+
+    def index(self, mode: str | int, *args) -> int:
+        """
+        :param mode: Name or index of a mode
+        :return: Its index
+        :raises ValueError: If there is no such mode
+        """
+        if isinstance(mode, str) and mode in self.names:
+            return self.names.index(mode)
+        if isinstance(mode, (int, np.integer)) and not isinstance(mode, bool) and 0 <= mode < len(self):
+            return int(mode)
+        raise ValueError(f"mode={mode!r} is unknown; the modes are {self.names} (or an index below {len(self)})")
+
+    def __str__(self) -> str:
+        if not self._modes:
+            return "no mode yet (no goal-reached trajectories have been clustered)"
+        width = max(4, *(len(mode.name) for mode in self._modes))
+        lines = [f"{'mode':<{width}}  trajectories  success  length   return"]
+        for mode in self._modes:
+            success = "    -" if np.isnan(mode.success_rate) else f"{mode.success_rate:5.2f}"
+            lines.append(
+                f"{mode.name:<{width}}  {mode.n_trajectories:12d}    {success}"
+                f"  {mode.mean_length:6.1f}  {mode.mean_return:7.2f}"
+            )
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"ModeTable({self.names})"
+
+
+def succeed(
+    old: Sequence[Mode], inheritance: Inheritance, step: int, first_free_number: int
+) -> tuple[list[Mode], list[str], int]:
+    """
+    The modes after a re-clustering: heirs keep name and record, newcomers get a name never used before.
+
+    :param old: Modes before
+    :param inheritance: Which new cluster follows which old mode
+    :param step: Environment steps so far
+    :param first_free_number: Number for the next new name
+    :return: The new modes, one line for each event (birth, split, merge, retirement), and the next free number
+    """
+    modes: list[Mode] = []
+    events: list[str] = []
+    number = first_free_number
+    for parent, kept in zip(inheritance.parents, inheritance.kept, strict=True):
+        if kept and parent is not None:
+            modes.append(old[parent])
+            continue
+        modes.append(Mode(name=f"mode_{number}", born_at=step))
+        events.append(f"{modes[-1].name} born" if parent is None else f"{modes[-1].name} split from {old[parent].name}")
+        number += 1
+    events += [f"{old[loser].name} merged into {modes[heir].name}" for loser, heir in sorted(inheritance.merged.items())]
+    events += [f"{old[gone].name} retired" for gone in sorted(inheritance.retired)]
+    return modes, events, number

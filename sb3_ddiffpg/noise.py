@@ -1,0 +1,44 @@
+"""Exploration noise."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from stable_baselines3.common.noise import VectorizedActionNoise
+
+
+class SpreadNormalActionNoise(VectorizedActionNoise):
+    """
+    Gaussian noise whose standard deviation differs between episodes: some environments follow the policy closely while
+    others search widely. Each episode draws its own, so that one environment sees all of them in time.
+
+    :param n_envs: Number of environments
+    :param action_dim: Size of the action
+    :param low: Smallest standard deviation
+    :param high: Largest standard deviation
+    """
+
+    def __init__(self, n_envs: int, action_dim: int, low: float = 0.05, high: float = 0.6) -> None:
+        if not 0 <= low <= high:
+            raise ValueError(f"low and high must satisfy 0 <= low <= high, got low={low}, high={high}")
+        # Not VectorizedActionNoise's constructor: it copies one noise object per environment
+        self.shape = (n_envs, action_dim)
+        self.low, self.high = low, high
+        self.sigma = np.full(n_envs, low)
+
+    def reset(self, indices: Iterable[int] | None = None) -> None:
+        """
+        Draw new standard deviations.
+
+        :param indices: Environments whose episode ended; all when None
+        """
+        chosen = np.arange(self.shape[0]) if indices is None else np.fromiter(indices, dtype=int)
+        self.sigma[chosen] = np.random.uniform(self.low, self.high, size=len(chosen))
+
+    def __call__(self) -> np.ndarray:
+        """
+        :return: Noise for actions in [-1, 1], shape [n_envs, action_dim]
+        """
+        return (np.random.standard_normal(self.shape) * self.sigma[:, None]).astype(np.float32)
+
+    def __repr__(self) -> str:
+        return f"SpreadNormalActionNoise(low={self.low}, high={self.high})"

@@ -1,0 +1,370 @@
+"""The policy: a diffusion actor that mode embeddings steer, the modes' critics, and the choice of a mode to act."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, get_actor_critic_arch
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_ddiffpg.critics import ModeCritics
+from sb3_ddiffpg.diffusion import Denoiser, DiffusionModel
+from sb3_ddiffpg.features import ScaledFlattenExtractor
+
+# Rows of the embedding table: 0 explores, m + 1 is mode m. No row: the zero embedding.
+EXPLORATORY_GROUP = 0
+UNCONDITIONED = -1
+
+
+class DiffusionActor(BasePolicy):
+    """
+    Diffusion policy conditioned on observation and mode embedding.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param net_arch: Hidden layers of the denoiser
+    :param features_extractor: Extracts the features of the observation
+    :param features_dim: Number of features
+    :param activation_fn: Activation of the denoiser
+    :param n_diffusion_steps: Number of diffusion steps T
+    :param mode_embedding_dim: Size of a mode embedding
+    :param time_embedding_dim: Size of a diffusion step's embedding
+    :param normalize_images: Whether images are divided by 255
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: nn.Module,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        n_diffusion_steps: int = 5,
+        mode_embedding_dim: int = 5,
+        time_embedding_dim: int = 32,
+        normalize_images: bool = True,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        self.net_arch, self.features_dim, self.activation_fn = net_arch, features_dim, activation_fn
+        self.n_diffusion_steps = n_diffusion_steps
+        self.mode_embedding_dim, self.time_embedding_dim = mode_embedding_dim, time_embedding_dim
+        denoiser = Denoiser(
+            condition_dim=features_dim + mode_embedding_dim,
+            action_dim=int(np.prod(action_space.shape)),
+            n_steps=n_diffusion_steps,
+            net_arch=net_arch,
+            activation_fn=activation_fn,
+            time_embedding_dim=time_embedding_dim,
+        )
+        self.diffusion = DiffusionModel(denoiser, n_diffusion_steps)
+        self.optimizer: th.optim.Optimizer
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            net_arch=self.net_arch,
+            features_dim=self.features_dim,
+            activation_fn=self.activation_fn,
+            n_diffusion_steps=self.n_diffusion_steps,
+            mode_embedding_dim=self.mode_embedding_dim,
+            time_embedding_dim=self.time_embedding_dim,
+            features_extractor=self.features_extractor,
+        )
+        return data
+
+    def condition(self, obs: PyTorchObs, embeddings: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param obs: Observations, [N, ...]
+        :param embeddings: Mode embeddings, [N, mode_embedding_dim]; zero when None
+        :return: What the denoiser is conditioned on, [N, features_dim + mode_embedding_dim]
+        """
+        features = self.extract_features(obs, self.features_extractor)
+        if embeddings is None:
+            embeddings = features.new_zeros(features.shape[0], self.mode_embedding_dim)
+        return th.cat((features, embeddings), dim=1)
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False, embeddings: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param obs: Observations, [N, ...]
+        :param deterministic: Zero initial latent, posterior means
+        :param embeddings: Mode embeddings, [N, mode_embedding_dim]; zero when None
+        :return: Actions in [-1, 1], [N, action_dim]
+        """
+        return self.diffusion.sample(self.condition(obs, embeddings), deterministic=deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self(observation, deterministic)
+
+
+class DiffusionPolicy(BasePolicy):
+    """
+    Diffusion actor, critics of all modes with their targets, and the mode embeddings.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate of the actor
+    :param net_arch: Hidden layers, a list or ``dict(pi=[...], qf=[...])``
+    :param activation_fn: Activation of the denoiser
+    :param critic_activation_fn: Activation of the critics
+    :param features_extractor_class: Features extractor; scales bounded observations when None, combines dict observations
+    :param features_extractor_kwargs: Its keyword arguments
+    :param normalize_images: Whether images are divided by 255
+    :param optimizer_class: Optimiser of actor and critics
+    :param optimizer_kwargs: Its keyword arguments, without the learning rate
+    :param n_modes: Number of modes M
+    :param n_diffusion_steps: Number of diffusion steps T
+    :param mode_embedding_dim: Size of a mode embedding
+    :param time_embedding_dim: Size of a diffusion step's embedding
+    :param n_critics: Critics per group
+    :param n_atoms: Atoms of the value distribution, 1 for scalar critics
+    :param support: Lower and upper end of the values of the modes' critics
+    :param exploration_support: The same for the exploratory critics
+    """
+
+    actor: DiffusionActor
+    critics: ModeCritics
+    critics_target: ModeCritics
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        critic_activation_fn: type[nn.Module] = nn.SiLU,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.AdamW,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        n_modes: int = 0,
+        n_diffusion_steps: int = 5,
+        mode_embedding_dim: int = 5,
+        time_embedding_dim: int = 32,
+        n_critics: int = 2,
+        n_atoms: int = 51,
+        support: tuple[float, float] = (0.0, 5.0),
+        exploration_support: tuple[float, float] = (0.0, 5.0),
+    ) -> None:
+        if features_extractor_class is None:
+            is_dict = isinstance(observation_space, spaces.Dict)
+            features_extractor_class = CombinedExtractor if is_dict else ScaledFlattenExtractor
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class,
+            features_extractor_kwargs,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            squash_output=True,
+            normalize_images=normalize_images,
+        )
+        self._constructor = dict(
+            net_arch=net_arch,
+            activation_fn=activation_fn,
+            critic_activation_fn=critic_activation_fn,
+            n_diffusion_steps=n_diffusion_steps,
+            mode_embedding_dim=mode_embedding_dim,
+            time_embedding_dim=time_embedding_dim,
+            n_critics=n_critics,
+            n_atoms=n_atoms,
+            support=support,
+            exploration_support=exploration_support,
+        )
+        actor_arch, critic_arch = get_actor_critic_arch([128, 128] if net_arch is None else net_arch)
+        extractor = self.make_features_extractor()
+        self.actor = DiffusionActor(
+            observation_space,
+            action_space,
+            net_arch=actor_arch,
+            features_extractor=extractor,
+            features_dim=extractor.features_dim,
+            activation_fn=activation_fn,
+            n_diffusion_steps=n_diffusion_steps,
+            mode_embedding_dim=mode_embedding_dim,
+            time_embedding_dim=time_embedding_dim,
+            normalize_images=normalize_images,
+        )
+        critic_arguments: dict[str, Any] = dict(
+            features_dim=extractor.features_dim,
+            action_dim=int(np.prod(action_space.shape)),
+            net_arch=critic_arch,
+            n_groups=n_modes + 1,
+            activation_fn=critic_activation_fn,
+            n_critics=n_critics,
+            n_atoms=n_atoms,
+            support=support,
+            exploration_support=exploration_support,
+        )
+        self.critics = ModeCritics(**critic_arguments)
+        self.critics_target = ModeCritics(**critic_arguments)
+        self.critics_target.load_state_dict(self.critics.state_dict())
+        # The critics see through their own extractor: the denoising loss must not shape their features
+        self.critic_features_extractor = self.make_features_extractor()
+        self.critic_features_extractor_target = self.make_features_extractor()
+        self.critic_features_extractor_target.load_state_dict(self.critic_features_extractor.state_dict())
+        self.mode_embeddings: th.Tensor
+        self.register_buffer("mode_embeddings", th.randn(n_modes + 1, mode_embedding_dim))
+        if "fused" not in self.optimizer_kwargs and optimizer_class in (th.optim.Adam, th.optim.AdamW):
+            # One kernel instead of one per parameter: a third of a small update's time
+            optimizer_kwargs = {"fused": True, **self.optimizer_kwargs}
+        else:
+            optimizer_kwargs = self.optimizer_kwargs
+        make: Any = optimizer_class
+        self.actor.optimizer = make(self.actor.parameters(), lr=lr_schedule(1), **optimizer_kwargs)
+        parameters = [*self.critics.parameters(), *self.critic_features_extractor.parameters()]
+        self.critics.optimizer = make(parameters, lr=lr_schedule(1), **optimizer_kwargs)
+        self._embeddings_in_use: th.Tensor | None = None
+        self.critics_target.train(False)
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes M."""
+        return self.critics.n_groups - 1
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            self._constructor,
+            n_modes=self.n_modes,
+            lr_schedule=self._dummy_schedule,
+            optimizer_class=self.optimizer_class,
+            optimizer_kwargs=self.optimizer_kwargs,
+            features_extractor_class=self.features_extractor_class,
+            features_extractor_kwargs=self.features_extractor_kwargs,
+        )
+        return data
+
+    # ------------------------------------------------------------------ modes
+
+    def inherit(self, parents: Sequence[int | None], kept: Sequence[bool], reset_output: bool = True) -> None:
+        """
+        Follow a re-clustering: critics, their targets, optimiser moments and embeddings of the new modes.
+
+        :param parents: For every new mode, the old one from which it inherits, or None
+        :param kept: Whether it also keeps that mode's embedding (and optimiser moments), or gets new ones
+        :param reset_output: Whether a mode without parent starts with a zeroed output layer
+        """
+        fresh = [not keeps for keeps in kept]
+        self.critics.inherit(parents, fresh, self.critics.optimizer, reset_output)
+        self.critics_target.inherit(parents, fresh, None, reset_output)
+        rows = [self.mode_embeddings[EXPLORATORY_GROUP]]
+        for parent, keeps in zip(parents, kept, strict=True):
+            known = keeps and parent is not None
+            rows.append(self.mode_embeddings[parent + 1] if known else self._new_embedding(rows))  # type: ignore[operator]
+        self.mode_embeddings = th.stack(rows)
+
+    def _new_embedding(self, others: list[th.Tensor]) -> th.Tensor:
+        """Of a few standard normal draws the one farthest from the other embeddings: close ones cannot be told apart."""
+        candidates = th.randn(16, self.mode_embeddings.shape[1], device=self.mode_embeddings.device)
+        distances = th.cdist(candidates, th.stack(others)).min(dim=1).values
+        return candidates[distances.argmax()]
+
+    def resize(self, n_modes: int) -> None:
+        """
+        Make room for a state dict with another number of modes.
+
+        :param n_modes: Number of modes M
+        """
+        if n_modes != self.n_modes:
+            self.inherit([None] * n_modes, [False] * n_modes)
+
+    def group_embeddings(self, groups: np.ndarray | th.Tensor) -> th.Tensor:
+        """
+        :param groups: Rows of the embedding table, ``UNCONDITIONED`` for the zero embedding, shape [N]
+        :return: Shape [N, mode_embedding_dim]
+        """
+        groups = th.as_tensor(groups, device=self.mode_embeddings.device).long()
+        return self.mode_embeddings[groups.clamp(min=0)] * (groups >= 0)[:, None]
+
+    # ------------------------------------------------------------------ acting
+
+    def critic_features(self, obs: PyTorchObs, target: bool = False) -> th.Tensor:
+        """
+        :param obs: Observations, G groups of n rows, [G * n, ...]
+        :param target: Through the target's extractor
+        :return: Shape [G, n, features_dim]
+        """
+        extractor = self.critic_features_extractor_target if target else self.critic_features_extractor
+        features = self.extract_features(obs, extractor)
+        return features.unflatten(0, (self.critics.n_groups, -1))
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self._predict(obs, deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self.actor(observation, deterministic, self._embeddings_in_use)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+        mode: int | np.ndarray | None = None,
+        group: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        Actions for one observation or a batch.
+
+        :param observation: The observation(s)
+        :param state: The mode held by every environment, as returned by the previous call
+        :param episode_start: Which environments begin an episode and so draw a new mode
+        :param deterministic: Without noise; the same call returns the same action
+        :param mode: Index of the mode to follow, one for all or one per observation. None: a mode is drawn for every
+            episode (given ``state`` or ``episode_start``), else the zero embedding
+        :param group: Rows of the embedding table, overrides ``mode``; for training
+        :return: The actions in the action space's bounds, and the state for the next call
+        """
+        if group is None and mode is not None:
+            modes = np.atleast_1d(np.asarray(mode))
+            if modes.size and (modes.min() < 0 or modes.max() >= self.n_modes):
+                raise ValueError(f"mode={mode!r} is unknown; this policy has {self.n_modes} modes, numbered from 0")
+            group = modes + 1
+            state = (modes,)
+        elif group is None and (state is not None or episode_start is not None):
+            held = self._draw_modes(state, episode_start)
+            group, state = held + 1, (held,)
+            group[held < 0] = UNCONDITIONED
+        self._embeddings_in_use = None
+        if group is not None:
+            n_obs = self.obs_to_tensor(observation)[0]
+            n_rows = len(next(iter(n_obs.values())) if isinstance(n_obs, dict) else n_obs)
+            self._embeddings_in_use = self.group_embeddings(np.broadcast_to(group, (n_rows,)).copy())
+        try:
+            return super().predict(observation, state, episode_start, deterministic)
+        finally:
+            self._embeddings_in_use = None
+
+    def _draw_modes(self, state: tuple[np.ndarray, ...] | None, episode_start: np.ndarray | None) -> np.ndarray:
+        """The modes to follow: kept through an episode, drawn uniformly at its start; -1 while there is none."""
+        if state is None:
+            held = np.full(len(np.atleast_1d(episode_start)), -1)  # type: ignore[arg-type]
+            starts = np.ones(len(held), dtype=bool)
+        else:
+            held = np.array(state[0])
+            starts = np.zeros(len(held), dtype=bool) if episode_start is None else np.atleast_1d(episode_start).astype(bool)
+        if self.n_modes:
+            held[starts] = np.random.randint(0, self.n_modes, size=int(starts.sum()))
+        return held
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        :param mode: True for training, False for evaluation (dropout, batch norm of the extractors)
+        """
+        self.actor.set_training_mode(mode)
+        self.critics.train(mode)
+        self.critic_features_extractor.train(mode)
+        self.training = mode

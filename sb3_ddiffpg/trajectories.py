@@ -1,0 +1,146 @@
+"""The parts of the replay buffer: trajectories, sets of rows, what counts as a success, and cached distances."""
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from sb3_ddiffpg.clustering import dtw_distances
+
+SUCCESS_KEYS = ("is_success", "success")
+NO_MODE = -1
+
+
+@dataclass(eq=False)
+class Trajectory:
+    """
+    A finished episode in the buffer.
+
+    :param rows: Rows of its transitions in order, shape [length], int32
+    :param success: Whether it reached the goal
+    :param episode_return: Sum of its rewards
+    :param serial: Running number in order of finishing
+    :param mode: Index of the mode that owns it, ``NO_MODE`` before the first clustering or for an outlier
+    :param path: Mode features resampled to equal steps, shape [n_path_points, dim]; made when first needed
+    """
+
+    rows: np.ndarray
+    success: bool
+    episode_return: float
+    serial: int
+    mode: int = NO_MODE
+    path: np.ndarray | None = field(default=None, repr=False)
+
+    @property
+    def length(self) -> int:
+        """Number of transitions."""
+        return len(self.rows)
+
+
+class RowSet:
+    """
+    A set of rows that is sampled, extended and reduced in time independent of its size. Sets that never share a row may
+    share one ``position`` array.
+
+    :param position: Where each row stands in ``rows``, shape [capacity], int32
+    """
+
+    def __init__(self, position: np.ndarray) -> None:
+        self.position = position
+        self.rows = np.empty(64, dtype=np.int32)
+        self.size = 0
+
+    def add(self, rows: np.ndarray) -> None:
+        """
+        :param rows: Rows that are in no set yet
+        """
+        new_size = self.size + len(rows)
+        if new_size > len(self.rows):
+            self.rows = np.concatenate((self.rows[: self.size], np.empty(max(new_size, len(self.rows)), dtype=np.int32)))
+        self.rows[self.size : new_size] = rows
+        self.position[rows] = np.arange(self.size, new_size, dtype=np.int32)
+        self.size = new_size
+
+    def remove(self, rows: np.ndarray) -> None:
+        """
+        :param rows: Rows of this set; the holes they leave are filled from the end
+        """
+        new_size = self.size - len(rows)
+        holes = self.position[rows]
+        in_tail = np.zeros(len(rows), dtype=bool)
+        in_tail[holes[holes >= new_size] - new_size] = True
+        movers = self.rows[new_size : self.size][~in_tail]
+        holes = holes[holes < new_size]
+        self.rows[holes] = movers
+        self.position[movers] = holes
+        self.size = new_size
+
+    def sample(self, n: int) -> np.ndarray:
+        """
+        :param n: Number of rows to draw with replacement
+        :return: Shape [n]
+        """
+        return self.rows[np.random.randint(0, self.size, size=n)]
+
+
+class SuccessRule:
+    """
+    Tells whether a finished episode reached its goal: by the environment's word, or, where no environment ever gives it, by
+    a return in the top fifth of those seen lately, so that the algorithm also learns on an ordinary dense-reward task.
+
+    :param success_key: Key of ``info``; None looks for ``SUCCESS_KEYS``
+    """
+
+    def __init__(self, success_key: str | None = None) -> None:
+        self.success_key = success_key
+        self.has_signal = False
+        self.recent_returns: deque[float] = deque(maxlen=500)
+
+    def __call__(self, info: dict[str, Any], episode_return: float) -> bool:
+        """
+        :param info: Of the episode's last step
+        :param episode_return: Sum of its rewards
+        :raises ValueError: If ``success_key`` was given and is not there
+        """
+        for key in SUCCESS_KEYS if self.success_key is None else (self.success_key,):
+            if key in info:
+                self.has_signal = True
+                return bool(info[key])
+        if self.success_key is not None:
+            raise ValueError(f"success_key={self.success_key!r} is not in an episode's last info; its keys: {sorted(info)}")
+        if self.has_signal:
+            return False
+        self.recent_returns.append(episode_return)
+        if len(self.recent_returns) < 5:
+            return False
+        return bool(episode_return >= np.quantile(self.recent_returns, 0.8) and episode_return > min(self.recent_returns))
+
+
+class DistanceCache:
+    """Pairwise DTW distances of the last set of paths: of the next set only the new pairs are computed."""
+
+    def __init__(self) -> None:
+        self.serials = np.zeros(0, dtype=np.int64)
+        self.distances = np.zeros((0, 0), dtype=np.float32)
+
+    def __call__(self, serials: np.ndarray, paths: list[np.ndarray]) -> np.ndarray:
+        """
+        :param serials: Ascending numbers that identify the paths, shape [N]
+        :param paths: Each [n_path_points, dim]
+        :return: Shape [N, N]
+        """
+        known = np.isin(serials, self.serials)
+        old = np.searchsorted(self.serials, serials[known])
+        distances = np.zeros((len(serials), len(serials)), dtype=np.float32)
+        distances[np.ix_(known, known)] = self.distances[np.ix_(old, old)]
+        if not known.all():
+            new = [path for path, is_known in zip(paths, known, strict=True) if not is_known]
+            distances[np.ix_(~known, ~known)] = dtw_distances(new)
+            if known.any():
+                seen = [path for path, is_known in zip(paths, known, strict=True) if is_known]
+                across = dtw_distances(new, seen)
+                distances[np.ix_(~known, known)] = across
+                distances[np.ix_(known, ~known)] = across.T
+        self.serials, self.distances = serials, distances
+        return distances

@@ -1,0 +1,346 @@
+"""
+DDiffPG in the RL zoo: ``ddiffpg train``, ``ddiffpg enjoy`` and ``ddiffpg record_video``, with all options of the zoo's own
+scripts (https://rl-baselines3-zoo.readthedocs.io) and DDiffPG where nothing else is asked for.
+"""
+
+import argparse
+import difflib
+import importlib
+import inspect
+import os
+import runpy
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from sb3_ddiffpg.ddiffpg import DDiffPG
+from sb3_ddiffpg.envs import make_vec_env
+
+try:
+    import optuna
+    import rl_zoo3.enjoy
+    import rl_zoo3.train
+    from rl_zoo3.exp_manager import ExperimentManager
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+    from rl_zoo3.utils import ALGOS, SimpleLinearSchedule
+except ImportError as error:
+    raise ImportError(f"the RL zoo is an extra ({error}); install it with: pip install 'sb3_ddiffpg[zoo]'") from error
+
+ALGO = "ddiffpg"
+
+# Keys of the zoo's YAML files that its ExperimentManager takes out before it calls the algorithm
+ZOO_KEYS = {
+    "callback",
+    "env_kwargs",
+    "env_wrapper",
+    "frame_stack",
+    "monitor_kwargs",
+    "n_envs",
+    "n_timesteps",
+    "noise_std",
+    "noise_type",
+    "normalize",
+    "vec_env_wrapper",
+}
+# Constructor arguments that come from the command line
+COMMAND_LINE_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
+
+
+def register() -> None:
+    """
+    Make DDiffPG known to the zoo, with its sampler for Optuna and the :class:`ModeExperimentManager`. Call it before
+    the zoo's functions; they read the names of the algorithms when they start.
+    """
+    ALGOS[ALGO] = DDiffPG
+    HYPERPARAMS_SAMPLER[ALGO] = sample_ddiffpg_params
+    HYPERPARAMS_CONVERTER[ALGO] = convert_ddiffpg_params
+    rl_zoo3.train.ExperimentManager = ModeExperimentManager  # type: ignore[misc]
+
+
+def config_file(algo: str) -> Path | None:
+    """
+    :param algo: Name of an algorithm in the zoo
+    :return: Our YAML file for it, installed or in a checkout; None when there is none
+    """
+    package = Path(__file__).parent
+    for folder in (package, package.parent):
+        if (path := folder / "zoo_hyperparams" / f"{algo}.yml").is_file():
+            return path
+    return None
+
+
+def check_hyperparameters(algo: str, keys: Sequence[str]) -> None:
+    """
+    The zoo hands unknown keys on when it builds a model, and drops them silently when it resumes one.
+
+    :param algo: Name of an algorithm in the zoo
+    :param keys: Names of hyperparameters, from a YAML file or the command line
+    :raises TypeError: If one is neither a key of the zoo nor an argument of the algorithm. Not a ValueError: the zoo
+        takes those for an unlucky trial when it optimises.
+    """
+    arguments = set(inspect.signature(ALGOS[algo].__init__).parameters) - COMMAND_LINE_ARGUMENTS
+    for key in keys:
+        if key in arguments or key in ZOO_KEYS:
+            continue
+        near = difflib.get_close_matches(key, sorted(arguments | ZOO_KEYS))
+        hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"it takes {', '.join(sorted(arguments))}"
+        raise TypeError(f"{key!r} is not a hyperparameter of {algo}: {hint}")
+
+
+class ModeExperimentManager(ExperimentManager):
+    """
+    The zoo's manager, which refuses unknown hyperparameters, steps this package's tasks all at once, and evaluates
+    DDiffPG with sampled actions: a deterministic evaluation would show one mode only.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if self.algo == ALGO:
+            self.deterministic_eval = False
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        check_hyperparameters(self.algo, list(hyperparams))
+        return super()._preprocess_hyperparams(hyperparams)
+
+    @staticmethod
+    def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
+        # The zoo knows `lin_3e-4` for the learning rate alone, and YAML reads 3e-4 as a string
+        value = hyperparams.get("qf_learning_rate")
+        if isinstance(value, str):
+            try:
+                number = float(value.removeprefix("lin_"))
+            except ValueError:
+                raise TypeError(f"qf_learning_rate must be a number or 'lin_<number>', got {value!r}") from None
+            hyperparams["qf_learning_rate"] = SimpleLinearSchedule(number) if value.startswith("lin_") else number
+        return ExperimentManager._preprocess_schedules(hyperparams)
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        model = super()._load_pretrained_agent(hyperparams, env)
+        # The zoo counts steps from zero again; with a full buffer the random warm-up would only do harm
+        if self.algo == ALGO and model.replay_buffer.size() > 0:  # type: ignore[attr-defined]
+            model.learning_starts = 0  # type: ignore[attr-defined]
+        return model
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """
+        :param n_envs: Number of environments
+        :param eval_env: Whether they serve the evaluation
+        :param no_log: Whether to write no monitor file
+        :return: Environments that step together for the tasks of this package, otherwise what the zoo makes
+        """
+        env_id = self.env_name.gym_id
+        ours = str(gym.spec(env_id).entry_point).startswith("sb3_ddiffpg.")
+        wrapped = self.env_wrapper is not None or self.frame_stack is not None
+        if not ours or wrapped or self.vec_env_class is SubprocVecEnv:
+            return super().create_envs(n_envs, eval_env, no_log)
+        env_kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
+        monitor_file = None if eval_env or no_log else os.path.join(self.save_path, "0")
+        env = make_vec_env(env_id, n_envs, seed=self.seed, **env_kwargs)
+        if isinstance(env, VecMonitor):  # it writes no file
+            env = env.venv
+        env = VecMonitor(env, monitor_file, **{"info_keywords": ("is_success",), **self.monitor_kwargs})
+        if self.vec_env_wrapper is not None:
+            env = self.vec_env_wrapper(env)
+        return self._maybe_normalize(env, eval_env)
+
+
+def convert_ddiffpg_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: What Optuna sampled
+    :return: Constructor arguments of DDiffPG
+    """
+    hyperparams = dict(sampled_params)
+    hyperparams["gamma"] = 1 - hyperparams.pop("one_minus_gamma")
+    hyperparams["batch_size"] = 2 ** hyperparams.pop("batch_size_pow")
+    return hyperparams
+
+
+def sample_ddiffpg_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Hyperparameters of one trial. The networks stay those of the YAML file.
+
+    :param trial: Optuna's trial
+    :param n_actions: Not used
+    :param n_envs: Not used
+    :param additional_args: Not used
+    :return: Constructor arguments of DDiffPG
+    """
+    sampled = {
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
+        "qf_learning_rate": trial.suggest_float("qf_learning_rate", 1e-4, 3e-3, log=True),
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.003, 0.05, log=True),
+        "batch_size_pow": trial.suggest_int("batch_size_pow", 7, 12),
+        "tau": trial.suggest_float("tau", 0.005, 0.1, log=True),
+        "gradient_steps": trial.suggest_int("gradient_steps", 1, 8, log=True),
+        "action_lr": trial.suggest_float("action_lr", 0.01, 0.5, log=True),
+        "n_action_gradient_steps": trial.suggest_int("n_action_gradient_steps", 1, 20, log=True),
+        "mode_n_steps": trial.suggest_int("mode_n_steps", 1, 5),
+        "mode_mask_prob": trial.suggest_float("mode_mask_prob", 0.1, 0.8),
+        "recluster_freq": trial.suggest_categorical("recluster_freq", [25, 50, 100, 200]),
+        "intrinsic_coef": trial.suggest_float("intrinsic_coef", 1e-3, 1.0, log=True),
+    }
+    hyperparams = convert_ddiffpg_params(sampled)
+    # What was sampled are the exponents; show the values too
+    for name in ("gamma", "batch_size"):
+        trial.set_user_attr(name, hyperparams[name])
+    return hyperparams
+
+
+class OutcomeVecEnv(DummyVecEnv):
+    """
+    Counts how the episodes ended, by the ground-truth label in ``info["mode"]``.
+
+    :param env_fns: Functions that make the environments
+    :param outcomes: Label -> [episodes, successes]; counted up in place
+    """
+
+    def __init__(self, env_fns: list[Callable[[], gym.Env]], outcomes: dict[str, list[int]]) -> None:
+        super().__init__(env_fns)
+        self.outcomes = outcomes
+
+    def step_wait(self) -> VecEnvStepReturn:
+        observations, rewards, dones, infos = super().step_wait()
+        for index in np.flatnonzero(dones):
+            if "mode" in infos[index]:
+                label = infos[index]["mode"]
+                outcome = self.outcomes["(no goal)" if label is None else str(label)]
+                outcome[0] += 1
+                outcome[1] += bool(infos[index].get("is_success", False))
+        return observations, rewards, dones, infos
+
+
+def commanded_to(mode: str | int) -> type[DDiffPG]:
+    """
+    :param mode: Name or index of a mode
+    :return: DDiffPG whose predictions follow this mode where no other is asked for
+    """
+
+    class CommandedDDiffPG(DDiffPG):
+        def predict(self, *args: Any, **kwargs: Any) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+            return super().predict(*args, **{"mode": mode, **kwargs})
+
+    return CommandedDDiffPG
+
+
+def train(arguments: Sequence[str]) -> None:
+    """
+    The zoo's training script. Takes ``--n-envs`` beside its options.
+
+    :param arguments: Command line, without the name of the program
+    """
+    parser = _parser()
+    parser.add_argument("--n-envs")
+    parser.add_argument("-params", "--hyperparams", nargs="+", default=[])
+    known, rest = _read(parser, arguments)
+    hyperparams = [*known.hyperparams, *([] if known.n_envs is None else [f"n_envs:{known.n_envs}"])]
+    if hyperparams:
+        rest += ["--hyperparams", *hyperparams]
+    path = config_file(known.algo)
+    with _command_line([*([] if path is None else ["--conf-file", str(path)]), *rest]):
+        rl_zoo3.train.train()
+
+
+def enjoy(arguments: Sequence[str]) -> None:
+    """
+    The zoo's script that watches a trained agent. Takes ``--mode NAME_OR_INDEX`` beside its options, looks into
+    ``logs``, samples actions unless told ``--deterministic``, and counts the outcomes by the environment's own label.
+
+    :param arguments: Command line, without the name of the program
+    """
+    outcomes: dict[str, list[int]] = defaultdict(lambda: [0, 0])
+    vec_env_cls = ExperimentManager.default_vec_env_cls
+    ExperimentManager.default_vec_env_cls = partial(OutcomeVecEnv, outcomes=outcomes)  # type: ignore[assignment]
+    try:
+        _play(rl_zoo3.enjoy.enjoy, arguments)
+    finally:
+        ExperimentManager.default_vec_env_cls = vec_env_cls
+    if outcomes:
+        width = max(13, *(len(label) for label in outcomes))
+        print(f"{'observed mode':<{width}}  episodes  successes")
+        for label, (episodes, successes) in sorted(outcomes.items(), key=lambda item: -item[1][0]):
+            print(f"{label:<{width}}  {episodes:8d}  {successes:9d}")
+
+
+def record_video(arguments: Sequence[str]) -> None:
+    """
+    The zoo's script that films a trained agent, with the additions of :func:`enjoy`.
+
+    :param arguments: Command line, without the name of the program
+    """
+    _play(partial(runpy.run_module, "rl_zoo3.record_video", run_name="__main__"), arguments)
+
+
+COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {"train": train, "enjoy": enjoy, "record_video": record_video}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """
+    :param arguments: A command and its options; those of the process when None
+    """
+    parser = argparse.ArgumentParser(
+        prog="ddiffpg",
+        description="DDiffPG in the RL zoo.",
+        epilog="`ddiffpg COMMAND -h` lists the zoo's options. Beside them: train --n-envs N; enjoy and record_video --mode M.",
+    )
+    parser.add_argument("command", choices=list(COMMANDS))
+    parser.add_argument("options", nargs=argparse.REMAINDER)
+    known = parser.parse_args(arguments)
+    COMMANDS[known.command](known.options)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--algo", default=ALGO)
+    parser.add_argument("--env")
+    return parser
+
+
+def _read(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Take out what ``parser`` knows, and see to it that the zoo will know the algorithm and the environment."""
+    register()
+    known, rest = parser.parse_known_args(arguments)
+    if known.env is not None:
+        rest += ["--env", known.env]
+        if known.env not in gym.registry:
+            gym.register_envs(importlib.import_module("gymnasium_robotics"))
+    return known, [*rest, "--algo", known.algo]
+
+
+@contextmanager
+def _command_line(arguments: Sequence[str]) -> Iterator[None]:
+    """The zoo's scripts read ``sys.argv``."""
+    before = sys.argv
+    sys.argv = [before[0], *arguments]
+    try:
+        yield
+    finally:
+        sys.argv = before
+
+
+def _play(script: Callable[[], Any], arguments: Sequence[str]) -> None:
+    """Run one of the zoo's scripts that play a trained agent."""
+    parser = _parser()
+    parser.add_argument("--mode", type=lambda value: int(value) if value.isdigit() else value)
+    known, rest = _read(parser, arguments)
+    if known.mode is not None:
+        if known.algo != ALGO:
+            raise SystemExit(f"--mode needs --algo {ALGO}, got {known.algo}")
+        ALGOS[ALGO] = commanded_to(known.mode)
+    if known.algo == ALGO and "--deterministic" not in rest:
+        rest.append("--stochastic")
+    try:
+        # First, so that the user's own option wins
+        with _command_line(["--folder", "logs", *rest]):
+            script()
+    finally:
+        ALGOS[ALGO] = DDiffPG

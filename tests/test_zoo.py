@@ -1,0 +1,261 @@
+"""The RL zoo's commands with DDiffPG: training, resuming, watching, filming, optimising."""
+
+import argparse
+import inspect
+import re
+import runpy
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium as gym
+import gymnasium_robotics
+import optuna
+import pytest
+import yaml
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import ALGOS
+from stable_baselines3.common.vec_env import VecMonitor
+from torch import nn, optim
+
+from sb3_ddiffpg import DDiffPG, zoo
+from sb3_ddiffpg.envs import PointMazeVecEnv
+from sb3_ddiffpg.zoo import ModeExperimentManager, check_hyperparameters, main
+
+ENV = "PointMazeV1-v0"
+# The goal is next to the start: random actions find it
+MAP = ["#####", "#.rg#", "#####"]
+ENV_KWARGS = ["--env-kwargs", f"maze_map:{MAP}", "start_noise:0"]
+SMALL = {
+    "learning_starts": 100,
+    "batch_size": 32,
+    "buffer_size": 5000,
+    "min_mode_size": 2,
+    "recluster_freq": 20,
+    "policy_kwargs": {"net_arch": [16]},
+}
+
+
+def hyperparams(**changes):
+    return ["--hyperparams", *(f"{key}:{value!r}" for key, value in (SMALL | changes).items())]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """A folder in which an agent was trained, with everything the zoo can write on the way."""
+    folder = tmp_path_factory.mktemp("zoo")
+    command = ["train", "--env", ENV, "-n", "1600", "--n-envs", "4", "--seed", "1", "-f", str(folder)]
+    command += ["-tb", str(folder / "tb"), "--eval-freq", "800", "--eval-episodes", "2", "--save-freq", "800"]
+    main([*command, "--save-replay-buffer", *ENV_KWARGS, *hyperparams()])
+    return folder
+
+
+@pytest.fixture
+def run(logs):
+    return logs / "ddiffpg" / f"{ENV}_1"
+
+
+def train(folder, *options, **changes):
+    main(["train", "--env", ENV, "-n", "150", "--eval-freq", "-1", "-f", str(folder), *options, *hyperparams(**changes)])
+
+
+def test_training_leaves_what_the_zoo_looks_for(logs, run):
+    expected = {"best_model.zip", "evaluations.npz", "replay_buffer.pkl", f"{ENV}.zip"}
+    assert expected | {"rl_model_800_steps.zip", "rl_model_1600_steps.zip"} <= {path.name for path in run.iterdir()}
+    assert list((logs / "tb").rglob("events.out.tfevents*"))
+    # --n-envs joins --hyperparams instead of replacing it
+    config = yaml.unsafe_load((run / ENV / "config.yml").read_text())
+    assert config["n_envs"] == 4 and config["learning_starts"] == 100
+    # successes for `plot_train -y success`
+    header, *episodes = (run / "0.monitor.csv").read_text().splitlines()[1:]
+    assert header.split(",")[-1] == "is_success" and "True" in "".join(episodes)
+    model = DDiffPG.load(run / f"{ENV}.zip")
+    assert model.num_timesteps == 1600 and model.batch_size == 32 and len(model.modes) >= 1
+
+
+def test_resume(run, tmp_path):
+    before = DDiffPG.load(run / f"{ENV}.zip")
+    train(tmp_path, "-i", str(run / f"{ENV}.zip"), "--save-replay-buffer", *ENV_KWARGS, n_envs=4, qf_learning_rate="lin_2e-4")
+    resumed = tmp_path / "ddiffpg" / f"{ENV}_1"
+    after = DDiffPG.load(resumed / f"{ENV}.zip")
+    after.load_replay_buffer(resumed / "replay_buffer.pkl")
+    assert after._n_updates > before._n_updates
+    assert set(before.modes.names) & set(after.modes.names)
+    assert after.qf_learning_rate(0.5) == pytest.approx(1e-4)
+    # the buffer came along, so that every step was one of the policy and was learnt from
+    assert after.learning_starts == 0
+    assert after.replay_buffer.size() * 4 > 1600
+
+
+def test_resuming_refuses_unknown_keys(run, tmp_path):
+    # the zoo would set an attribute that nobody reads
+    with pytest.raises(TypeError, match="'recluster_frq' is not a hyperparameter of ddiffpg: did you mean 'recluster_freq'"):
+        train(tmp_path, "-i", str(run / f"{ENV}.zip"), recluster_frq=3)
+
+
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("n_timestep", "did you mean 'n_timesteps'"),
+        ("action_learning_rate", "learning_rate"),
+        ("seed", "not a hyperparameter"),
+        ("zzz", "it takes action_lr, "),
+    ],
+)
+def test_unknown_key_in_a_file(tmp_path, key, message):
+    path = tmp_path / "own.yml"
+    path.write_text(yaml.dump({"default": {"policy": "DiffusionPolicy", "n_timesteps": 100, key: 1}}))
+    with pytest.raises(TypeError, match=message) as caught:
+        main(["train", "--env", ENV, "--conf-file", str(path), "-f", str(tmp_path / "logs")])
+    assert repr(key) in str(caught.value)
+    assert not (tmp_path / "logs").exists()
+
+
+def test_optimisation_does_not_swallow_an_unknown_key(tmp_path):
+    with pytest.raises(TypeError, match="recluster_frq"):
+        train(tmp_path, "-optimize", "--n-trials", "1", recluster_frq=3)
+
+
+@pytest.mark.parametrize("options", [[], ["--mode", "0"], ["--mode", "0", "--deterministic"]])
+def test_enjoy(logs, capsys, monkeypatch, options):
+    seen = []
+    predict = DDiffPG.predict
+
+    def spy(self, *args, **kwargs):
+        seen.append((kwargs.get("mode"), kwargs["deterministic"]))
+        return predict(self, *args, **kwargs)
+
+    monkeypatch.setattr(DDiffPG, "predict", spy)
+    monkeypatch.setattr(sys, "argv", ["enjoy.py"])
+    main(["enjoy", "--env", ENV, "--no-render", "-n", "300", "-f", str(logs), *options])
+    assert set(seen) == {(0 if "--mode" in options else None, "--deterministic" in options)}
+    # our table against the zoo's own statistics
+    printed = capsys.readouterr().out
+    rows = re.findall(r"^\S.*?  +(\d+)  +(\d+)$", printed.split("successes\n")[1], re.MULTILINE)
+    episodes, successes = (sum(column) for column in zip(*(map(int, row) for row in rows), strict=True))
+    assert f"\n{episodes} Episodes" in printed
+    assert f"Success rate: {100 * successes / episodes:.2f}%" in printed
+    # and nothing of it stays behind
+    assert ALGOS["ddiffpg"] is DDiffPG and ExperimentManager.default_vec_env_cls is None and sys.argv == ["enjoy.py"]
+
+
+def test_enjoy_names_the_known_modes(logs):
+    with pytest.raises(ValueError, match="'nowhere' is unknown; the modes are"):
+        main(["enjoy", "--env", ENV, "--no-render", "-n", "10", "-f", str(logs), "--mode", "nowhere"])
+    assert ALGOS["ddiffpg"] is DDiffPG
+    with pytest.raises(SystemExit, match="--mode needs --algo ddiffpg"):
+        main(["enjoy", "--algo", "td3", "--env", ENV, "--mode", "0"])
+
+
+def test_record_video(logs, tmp_path):
+    main(["record_video", "--env", ENV, "-n", "10", "-f", str(logs), "-o", str(tmp_path), "--mode", "0"])
+    (video,) = tmp_path.glob("*.mp4")
+    assert video.stat().st_size > 0
+
+
+def test_normalised_observations(tmp_path, capsys):
+    train(tmp_path, normalize={"norm_obs": True, "norm_reward": False})
+    assert (tmp_path / "ddiffpg" / f"{ENV}_1" / ENV / "vecnormalize.pkl").is_file()
+    main(["enjoy", "--env", ENV, "--no-render", "-n", "160", "-f", str(tmp_path)])
+    assert "Loading running average" in capsys.readouterr().out
+
+
+def test_optimise(tmp_path, capsys):
+    storage = ["--storage", str(tmp_path / "study.log"), "--study-name", "one"]
+    options = ["-optimize", "--n-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
+    train(tmp_path, *options, *storage, "--seed", "3", n_envs=2)
+    assert "Best trial:" in capsys.readouterr().out
+    assert list(tmp_path.glob("ddiffpg/report_*.csv"))
+
+
+def test_sampled_hyperparameters_are_accepted():
+    env = gym.make(ENV)
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for _ in range(5):
+        trial = study.ask()
+        sampled = zoo.sample_ddiffpg_params(trial, 2, 1, {})
+        # --trial-id rebuilds them from what the study has stored
+        assert zoo.convert_ddiffpg_params(trial.params) == sampled
+        assert trial.user_attrs == {"gamma": sampled["gamma"], "batch_size": sampled["batch_size"]}
+        DDiffPG("DiffusionPolicy", env, **sampled)
+
+
+def test_tracking_needs_nothing_of_ours(tmp_path, monkeypatch):
+    calls = {}
+    config = SimpleNamespace(setdefaults=lambda values: calls.update(config=values))
+    recorder = SimpleNamespace(init=lambda **options: calls.update(options) or SimpleNamespace(config=config))
+    monkeypatch.setitem(sys.modules, "wandb", recorder)
+    monkeypatch.chdir(tmp_path)
+    train(tmp_path, "--track")
+    assert calls["sync_tensorboard"] and calls["config"]["saved_hyperparams"]["batch_size"] == 32
+    assert list((tmp_path / "runs").rglob("events.out.tfevents*"))
+
+
+@pytest.mark.parametrize(("algo", "deterministic"), [("ddiffpg", False), ("td3", True)])
+def test_manager(tmp_path, algo, deterministic):
+    zoo.register()
+    manager = ModeExperimentManager(argparse.Namespace(), algo, ENV, str(tmp_path), env_kwargs={"maze_map": MAP}, seed=5)
+    assert manager.deterministic_eval is deterministic
+    env = manager.create_envs(3, eval_env=True)
+    assert isinstance(env, VecMonitor) and isinstance(env.venv, PointMazeVecEnv) and env.num_envs == 3
+    env.close()
+    # a wrapper around each environment cannot go around all of them
+    manager.env_wrapper = gym.wrappers.ClipAction
+    env = manager.create_envs(3, eval_env=True)
+    assert env.env_is_wrapped(gym.wrappers.ClipAction) == [True] * 3
+    env.close()
+
+
+def test_other_algorithms_keep_their_configuration(tmp_path):
+    main(["train", "--algo", "td3", "--env", ENV, "-n", "120", "--eval-freq", "-1", "-f", str(tmp_path)])
+    config = yaml.unsafe_load((tmp_path / "td3" / f"{ENV}_1" / ENV / "config.yml").read_text())
+    assert config["policy"] == "MlpPolicy"
+
+
+def test_qf_learning_rate_as_text():
+    parse = ModeExperimentManager._preprocess_schedules
+    assert parse({"qf_learning_rate": "lin_3e-4"})["qf_learning_rate"](0.5) == pytest.approx(1.5e-4)
+    assert parse({"qf_learning_rate": "3e-4"})["qf_learning_rate"] == pytest.approx(3e-4)
+    assert parse({"qf_learning_rate": 3e-4, "learning_rate": "lin_1e-3"})["learning_rate"](0.5) == pytest.approx(5e-4)
+    with pytest.raises(TypeError, match="qf_learning_rate must be a number or 'lin_<number>', got 'fast'"):
+        parse({"qf_learning_rate": "fast"})
+
+
+def test_our_configuration():
+    zoo.register()
+    entries = yaml.safe_load(zoo.config_file("ddiffpg").read_text())
+    gym.register_envs(gymnasium_robotics)
+    for name, entry in entries.items():
+        check_hyperparameters("ddiffpg", list(entry))
+        assert {"policy", "n_timesteps"} <= set(entry), name
+        assert name in ("paper", "default") or name in gym.registry
+    assert zoo.config_file("td3") is None
+
+
+def test_papers_numbers():
+    entry = yaml.safe_load(zoo.config_file("ddiffpg").read_text())["paper"]
+    # Li et al. 2024, table of hyperparameters
+    table = {"n_envs": 256, "qf_learning_rate": 5e-4, "learning_rate": 3e-4, "action_lr": 3e-2, "v_min": 0, "v_max": 5}
+    table |= {"n_atoms": 51, "tau": 5e-2, "batch_size": 4096, "gradient_steps": 8, "gamma": 0.99, "max_grad_norm": 1.0}
+    table |= {"buffer_size": 10**6, "recluster_freq": 100, "mode_embedding_dim": 5, "n_diffusion_steps": 5}
+    assert {key: entry[key] for key in table} == table
+    # the zoo evaluates this text where `nn` and `th` are imported
+    kwargs = eval(entry["policy_kwargs"], {"nn": nn, "th": SimpleNamespace(optim=optim)})
+    arguments = {key: entry[key] for key in entry if key in inspect.signature(DDiffPG.__init__).parameters}
+    model = DDiffPG(**(arguments | {"policy_kwargs": kwargs, "env": gym.make(ENV)}))
+    widths = [layer.out_features for layer in model.actor.modules() if isinstance(layer, nn.Linear)]
+    assert {1024, 512, 256} <= set(widths)
+
+
+def test_scripts(tmp_path, monkeypatch, capsys):
+    root = Path(__file__).parents[1]
+    for script in ("train", "enjoy", "record_video"):
+        monkeypatch.setattr(sys, "argv", [f"{script}.py", "--help"])
+        with pytest.raises(SystemExit) as stopped:
+            runpy.run_path(str(root / f"{script}.py"), run_name="__main__")
+        assert stopped.value.code == 0
+        # the zoo's help, in which our algorithm is a choice
+        assert "ddiffpg" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["fly"])
+    assert "fly" in capsys.readouterr().err
