@@ -2,7 +2,6 @@
 PYTHON := $(shell python3.11 -c "print('python3.11')" 2>/dev/null || echo python3)
 BIN := .venv/bin
 DEPENDENCIES := setup.cfg pyproject.toml constraints.txt
-SOURCES := sb3_ddiffpg tests benchmarks examples train.py enjoy.py record_video.py
 
 .PHONY: demo test fast slow lint type format bench clean
 
@@ -19,15 +18,15 @@ slow: .venv/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m slow
 
 lint: .venv/.installed-dev
-	$(BIN)/ruff check $(SOURCES)
-	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 
 type: .venv/.installed-dev
 	$(BIN)/mypy
 
 format: .venv/.installed-dev
-	$(BIN)/ruff check --fix $(SOURCES)
-	$(BIN)/ruff format $(SOURCES)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
 
 bench: .venv/.installed-dev
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done

@@ -68,7 +68,7 @@ class DDiffPG(OffPolicyAlgorithm):
     :param v_min: Lower end of the values' support
     :param v_max: Upper end of the support of the modes' critics
     :param exploration_v_max: Upper end of the support of the exploratory critics (lower end: minus that when
-        ``normalize_intrinsic``); ``v_max`` when None
+        ``normalize_intrinsic``, else 0)
     :param reward_scale: Factor on the environment's reward
     :param mode_n_steps: Length of the multi-step returns of the modes' critics (uncorrected)
     :param exploration_n_steps: The same for the exploratory critics
@@ -147,7 +147,7 @@ class DDiffPG(OffPolicyAlgorithm):
         n_atoms: int = 51,
         v_min: float = 0.0,
         v_max: float = 5.0,
-        exploration_v_max: float | None = None,
+        exploration_v_max: float = 5.0,
         reward_scale: float = 1.0,
         mode_n_steps: int = 5,
         exploration_n_steps: int = 1,
@@ -300,9 +300,8 @@ class DDiffPG(OffPolicyAlgorithm):
         self._create_aliases()
 
     def _exploration_support(self) -> tuple[float, float]:
-        upper = self.v_max if self.exploration_v_max is None else self.exploration_v_max
         # A standardised reward is negative where nothing is new
-        return (-upper if self.normalize_intrinsic else min(0.0, self.v_min), upper)
+        return (-self.exploration_v_max if self.normalize_intrinsic else 0.0, self.exploration_v_max)
 
     def _resolve_mode_features(self) -> None:
         if self.mode_features is not None:

@@ -15,7 +15,7 @@ AT_LEAST_ONE = (
     *("mode_embedding_dim", "batch_size", "buffer_size"),
 )
 SHARES = ("gamma", "tau", "mode_mask_prob", "exploration_fraction")
-POSITIVE = ("action_lr", "reward_scale", "max_grad_norm")
+POSITIVE = ("action_lr", "reward_scale", "max_grad_norm", "exploration_v_max")
 CHOICES = {"action_optimizer": ACTION_OPTIMIZERS, "backup_embedding": ("mode", "masked"), "linkage": LINKAGES}
 
 
@@ -54,10 +54,8 @@ def _check_ranges(model: Any) -> None:
     for name in POSITIVE:
         if not getattr(model, name) > 0:
             raise ValueError(f"{name} must be positive, got {getattr(model, name)!r}")
-    for name in ("distance_threshold", "exploration_v_max"):
-        value = getattr(model, name)
-        if value is not None and not value > 0:
-            raise ValueError(f"{name} must be positive or None, got {value!r}")
+    if model.distance_threshold is not None and not model.distance_threshold > 0:
+        raise ValueError(f"distance_threshold must be positive or None, got {model.distance_threshold!r}")
     for name, choices in CHOICES.items():
         if getattr(model, name) not in choices:
             raise ValueError(f"{name} must be one of {list(choices)}, got {getattr(model, name)!r}")

@@ -246,6 +246,15 @@ def test_wanderers_are_neither_a_mode_nor_in_the_way():
         assert np.mean(labels[len(truth) :] == -1) >= 0.5
 
 
+def test_a_few_alike_among_many_strangers_are_no_modes():
+    # Two triples, each of its own kind, among 20 trajectories as far from them as from one another.
+    distances = 1.0 - np.eye(26)
+    for triple in (slice(0, 3), slice(3, 6)):
+        distances[triple, triple] *= 0.1
+    assert automatic_labels(distances).tolist() == [0] * 26
+    assert automatic_labels(distances[:12, :12]).tolist() == [0, 0, 0, 1, 1, 1] + [-1] * 6
+
+
 def test_the_automatic_rule_has_no_unit():
     paths, _ = runs(np.random.default_rng(0), FIVE_WAYS, [6] * 5, 0.5)
     distances = dtw_distances(paths)
@@ -351,6 +360,8 @@ def test_ties_go_to_the_lowest_index():
     assert matched([0, 0, 1, 1], [0, 1, 0, 1], 2, 2) == Inheritance([0, 1], [True, True], {}, [])
     assert matched([0, 1, 2], [0, 0, 0], 3, 1) == Inheritance([0], [True], {1: 0, 2: 0}, [])
     assert matched([0, 0, 0], [0, 1, 2], 1, 3) == Inheritance([0, 0, 0], [True, False, False], {}, [])
+    # scipy's own choice would be cluster 2, the last.
+    assert matched([2, 2], [1, 2], 3, 3) == Inheritance([None, 2, 2], [False, True, False], {}, [0, 1])
 
 
 def test_labels_out_of_range():
@@ -373,7 +384,8 @@ def test_every_mode_has_one_fate(data, n_old, n_new, n):
         if before >= 0 and after >= 0:
             overlap[before, after] += 1
 
-    survivors = [parent for parent, kept in zip(result.parents, result.kept, strict=True) if kept]
+    survivors = [p for p, kept in zip(result.parents, result.kept, strict=True) if kept and p is not None]
+    assert len(survivors) == sum(result.kept)
     assert sorted([*survivors, *result.merged, *result.retired]) == list(range(n_old))
     for cluster_index, (parent, kept) in enumerate(zip(result.parents, result.kept, strict=True)):
         shares = overlap[:, cluster_index]

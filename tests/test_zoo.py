@@ -44,8 +44,8 @@ def hyperparams(**changes):
 def logs(tmp_path_factory):
     """A folder in which an agent was trained, with everything the zoo can write on the way."""
     folder = tmp_path_factory.mktemp("zoo")
-    command = ["train", "--env", ENV, "-n", "1600", "--n-envs", "4", "--seed", "1", "-f", str(folder)]
-    command += ["-tb", str(folder / "tb"), "--eval-freq", "800", "--eval-episodes", "2", "--save-freq", "800"]
+    command = ["train", "--env", ENV, "-n", "800", "--n-envs", "4", "--seed", "1", "-f", str(folder)]
+    command += ["-tb", str(folder / "tb"), "--eval-freq", "400", "--eval-episodes", "2", "--save-freq", "400"]
     main([*command, "--save-replay-buffer", *ENV_KWARGS, *hyperparams()])
     return folder
 
@@ -61,7 +61,7 @@ def train(folder, *options, **changes):
 
 def test_training_leaves_what_the_zoo_looks_for(logs, run):
     expected = {"best_model.zip", "evaluations.npz", "replay_buffer.pkl", f"{ENV}.zip"}
-    assert expected | {"rl_model_800_steps.zip", "rl_model_1600_steps.zip"} <= {path.name for path in run.iterdir()}
+    assert expected | {"rl_model_400_steps.zip", "rl_model_800_steps.zip"} <= {path.name for path in run.iterdir()}
     assert list((logs / "tb").rglob("events.out.tfevents*"))
     # --n-envs joins --hyperparams instead of replacing it
     config = yaml.unsafe_load((run / ENV / "config.yml").read_text())
@@ -70,7 +70,7 @@ def test_training_leaves_what_the_zoo_looks_for(logs, run):
     header, *episodes = (run / "0.monitor.csv").read_text().splitlines()[1:]
     assert header.split(",")[-1] == "is_success" and "True" in "".join(episodes)
     model = DDiffPG.load(run / f"{ENV}.zip")
-    assert model.num_timesteps == 1600 and model.batch_size == 32 and len(model.modes) >= 1
+    assert model.num_timesteps == 800 and model.batch_size == 32 and len(model.modes) >= 1
 
 
 def test_resume(run, tmp_path):
@@ -84,7 +84,7 @@ def test_resume(run, tmp_path):
     assert after.qf_learning_rate(0.5) == pytest.approx(1e-4)
     # the buffer came along, so that every step was one of the policy and was learnt from
     assert after.learning_starts == 0
-    assert after.replay_buffer.size() * 4 > 1600
+    assert after.replay_buffer.size() * 4 > 800
 
 
 def test_resuming_refuses_unknown_keys(run, tmp_path):
@@ -163,7 +163,7 @@ def test_normalised_observations(tmp_path, capsys):
 def test_optimise(tmp_path, capsys):
     storage = ["--storage", str(tmp_path / "study.log"), "--study-name", "one"]
     options = ["-optimize", "--n-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
-    train(tmp_path, *options, *storage, "--seed", "3", n_envs=2)
+    train(tmp_path, *options, *storage, "--seed", "3", n_envs=2, learning_starts=140)
     assert "Best trial:" in capsys.readouterr().out
     assert list(tmp_path.glob("ddiffpg/report_*.csv"))
 

@@ -18,8 +18,8 @@ class HideGoal(gym.Wrapper, RecordConstructorArgs):
     A maze of gymnasium-robotics (``PointMaze_*-v3``, ``AntMaze_*-v5``) with one fixed goal that is not observed.
 
     The observation is a flat float32 array: the environment's own ``observation``, with the position (x, y) before it
-    if it does not begin with that already. The reward is 1 at the goal and 0 elsewhere, whatever the environment's
-    ``reward_type``, and the episode terminates there, whatever its ``continuing_task``. ``info["is_success"]`` repeats
+    if it does not begin with that already. The reward is 1 at the goal and 0 elsewhere, and the episode terminates there:
+    ``reward_type`` and ``continuing_task`` of the wrapped environment are set so. ``info["is_success"]`` repeats
     ``info["success"]``. gymnasium-robotics draws start and goal anew in every episode and moves both by noise; here the
     goal is the exact centre of one cell, and the start one cell with the environment's noise.
     ``reset(options={"goal_cell": ..., "reset_cell": ...})`` changes them for one episode.
@@ -54,6 +54,8 @@ class HideGoal(gym.Wrapper, RecordConstructorArgs):
         if distances[self.goal_cell] < 1:
             raise ValueError(f"goal_cell: {self.goal_cell} given, but there is no way to it from reset_cell {self.reset_cell}")
 
+        # Set within, and not done in step(), because SB3's make_vec_env puts its Monitor between that and this wrapper
+        base.reward_type, base.continuing_task = "sparse", False
         # Whether the position is in the observation differs between the two families and is declared nowhere
         observation, _ = env.reset()
         self._prepend = not np.array_equal(observation["observation"][:2], observation["achieved_goal"])
@@ -112,7 +114,6 @@ class HideGoal(gym.Wrapper, RecordConstructorArgs):
         :param action: the environment's
         :return: observation, reward, terminated, truncated, info
         """
-        observation, _, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = self.env.step(action)
         info["is_success"] = bool(info["success"])
-        reached = info["is_success"]
-        return self._flat(observation), float(reached), bool(terminated) or reached, truncated, info
+        return self._flat(observation), float(reward), terminated, truncated, info
