@@ -4,6 +4,7 @@ Train DDiffPG on a point maze, command each mode that it found, and draw the rou
 """
 
 import argparse
+import json
 import time
 from collections import Counter
 from pathlib import Path
@@ -35,16 +36,29 @@ def train(env_id: str, seed: int, overrides: dict[str, Any]) -> DDiffPG:
     return model
 
 
-def summary_line(name: str, episodes: list[EpisodeResult]) -> str:
+def summarize(episodes: list[EpisodeResult]) -> dict[str, Any]:
     """
-    :param name: What was commanded
-    :param episodes: What came of it
-    :return: A line of the table
+    :param episodes: What came of one command
+    :return: Number of episodes and successes, mean length of the successes, and how often each route was taken
     """
     successes = [episode for episode in episodes if episode.success]
-    length = sum(episode.length for episode in successes) / max(len(successes), 1)
-    routes = ", ".join(f"{label} x{count}" for label, count in Counter(e.label for e in successes).most_common())
-    return f"{name:<12} {len(successes):4d}/{len(episodes):<4d} {length:8.1f}   {routes}"
+    return {
+        "episodes": len(episodes),
+        "successes": len(successes),
+        "length": sum(episode.length for episode in successes) / len(successes) if successes else None,
+        "routes": dict(Counter(str(episode.label) for episode in successes).most_common()),
+    }
+
+
+def format_line(name: str, summary: dict[str, Any]) -> str:
+    """
+    :param name: What was commanded
+    :param summary: From ``summarize``
+    :return: A line of the table
+    """
+    length = "       -" if summary["length"] is None else f"{summary['length']:8.1f}"
+    routes = ", ".join(f"{label} x{count}" for label, count in summary["routes"].items())
+    return f"{name:<12} {summary['successes']:4d}/{summary['episodes']:<4d} {length}   {routes}"
 
 
 def main() -> None:
@@ -59,20 +73,26 @@ def main() -> None:
 
     started = time.perf_counter()
     model = train(options.env, options.seed, options.override)
-    print(f"\ntrained for {time.perf_counter() - started:.0f} s, {model.num_timesteps} steps\n\n{model.modes}\n")
+    seconds = time.perf_counter() - started
+    print(f"\ntrained for {seconds:.0f} s, {model.num_timesteps} steps\n\n{model.modes}\n")
     options.output.mkdir(parents=True, exist_ok=True)
     model.save(options.output / "model.zip")
 
     # One fixed start: routes that differ only because their starts differ would be no modes
     test_env = make_vec_env(options.env, options.episodes, seed=options.seed + 1_000, start_noise=0.0)
     episodes = {name: run_episodes(model, test_env, options.episodes, mode=name) for name in model.modes.names}
+    summaries = {name: summarize(runs) for name, runs in episodes.items()}
+    summaries["(none)"] = summarize(run_episodes(model, test_env, options.episodes))
     print(f"{'commanded':<12} {'success':>9} {'length':>8}   routes taken (goal:word, see docs/point_mazes.md)")
-    for name, runs in episodes.items():
-        print(summary_line(name, runs))
-    print(summary_line("(none)", run_episodes(model, test_env, options.episodes)))
+    for name, summary in summaries.items():
+        print(format_line(name, summary))
+
+    settings = {"env": options.env, "seed": options.seed, "override": options.override, "steps": model.num_timesteps}
+    result = {**settings, "training_seconds": round(seconds, 1), "commanded": summaries}
+    (options.output / "result.json").write_text(json.dumps(result, indent=2) + "\n")
     figure = plot_routes(episodes, maze=test_env.get_attr("maze", indices=0)[0])
     figure.savefig(options.output / "modes.png", dpi=120)
-    print(f"\nwrote {options.output / 'model.zip'} and {options.output / 'modes.png'}")
+    print(f"\nwrote model.zip, modes.png and result.json to {options.output}")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -135,8 +136,8 @@ class ModeReplayBuffer(ReplayBuffer):
         """The operating system commits zeroed pages only when they are written, so an unfilled buffer stays small."""
 
         def zeros_like_space(space: spaces.Space) -> np.ndarray:
-            shape = space.shape if isinstance(space, spaces.Box) else self.obs_shape
-            return np.zeros((self.buffer_size, *shape), dtype=self._maybe_cast_dtype(space.dtype))
+            shape = get_obs_shape(space)
+            return np.zeros((self.buffer_size, *shape), dtype=self._maybe_cast_dtype(space.dtype))  # type: ignore[misc]
 
         if isinstance(self.observation_space, spaces.Dict):
             self.observations = {key: zeros_like_space(space) for key, space in self.observation_space.items()}

@@ -158,7 +158,7 @@ class VisitCounts(nn.Module):
 
     counts: th.Tensor
 
-    def __init__(self, position_dim: int, observation_dim: int, cell_size: float = 0.5, table_size: int = 2**18) -> None:
+    def __init__(self, position_dim: int, observation_dim: int, cell_size: float = 0.5, table_size: int = 2**16) -> None:
         super().__init__()
         if cell_size <= 0:
             raise ValueError(f"novelty_kwargs['cell_size'] must be positive, got {cell_size}")

@@ -30,7 +30,7 @@ def plot_routes(episodes: Mapping[str, Sequence[EpisodeResult]], maze: Any = Non
         for i, run in enumerate(runs):
             style = "-" if run.success else "--"
             axes.plot(run.path[:, 0], run.path[:, 1], style, color=color, alpha=0.35, lw=1, label=None if i else name)
-    legend = axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
+    legend = figure.legend(loc="outside right upper")
     for handle in legend.legend_handles:
         handle.set_alpha(1.0)
     axes.set_aspect("equal")

@@ -51,6 +51,10 @@ class RowSet:
         self.rows = np.empty(64, dtype=np.int32)
         self.size = 0
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The shared array is its owner's to pickle, and to put back."""
+        return {"rows": self.rows[: self.size], "size": self.size}
+
     def add(self, rows: np.ndarray) -> None:
         """
         :param rows: Rows that are in no set yet

@@ -132,7 +132,20 @@ def test_start_and_goal_on_a_cut():
     for corners, label in [([(-4, 0), (-4, -8)], "0:aB"), ([(4, 0), (4, -8)], "0:-")]:
         for _ in range(50):
             start, end = rng.uniform(-1, 1, 2), rng.uniform(-1, 1, 2) + maze.goals[0]
-            assert maze.label(polyline([start, *corners, end]), 0) == label
+            path = polyline([start, *corners, end])
+            assert maze.label(path, 0) == label
+            tracker = HomotopyTracker(maze, 1)
+            tracker.reset([0], path[:1])
+            for position in path[1:]:
+                tracker.step(position[None])
+            assert tracker.label(0, 0) == label
+
+
+def test_walls_that_touch_at_a_corner_are_one_island():
+    maze = Maze(["######", "#r...#", "#..#.#", "#.#..#", "#...g#", "######"])
+    assert [tuple(cut) for cut in maze.cuts] == [("a", 8, -2, 2)]
+    hanging = Maze(["#####", "#r..#", "##..#", "#.#g#", "#...#", "#####"])
+    assert hanging.cuts == []
 
 
 def test_many_islands_have_letters_of_their_own():

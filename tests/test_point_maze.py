@@ -288,6 +288,11 @@ def test_other_ids_go_to_sb3():
         make_vec_env("NoSuchEnv-v0", 2)
 
 
+def test_id_with_its_module():
+    assert make_vec_env("sb3_ddiffpg.envs:PointMazeV2-v0", 2).get_attr("maze")[1].name == "V2"
+    assert make_vec_env("gymnasium.envs.classic_control:Pendulum-v1", 2).num_envs == 2
+
+
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 @pytest.mark.parametrize("make", [lambda: PointMazeVecEnv(5, "V4", max_episode_steps=20), lambda: PointMazeEnv("V4")])
 def test_copies_go_on_like_the_original(make, clone):

@@ -1,6 +1,7 @@
 """Environments with several ways to the goal. Importing this module registers them with gymnasium."""
 
 from dataclasses import replace
+from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
@@ -36,13 +37,16 @@ def make_vec_env(env_id: str, n_envs: int = 1, seed: int | None = None, **env_kw
     The point mazes are stepped together as a :class:`PointMazeVecEnv`; for every other id this is SB3's
     ``make_vec_env``. Both give the same numbers.
 
-    :param env_id: id of a registered environment
+    :param env_id: id of a registered environment, perhaps with the module that registers it: ``"module:id"``
     :param n_envs: number of environments
     :param seed: environment i is seeded with ``seed + i`` at the first reset
     :param env_kwargs: arguments of ``gym.make``, such as ``max_episode_steps`` or ``maze_map``
     :return: the vectorised environment, with monitor
     """
-    spec = gym.spec(env_id)
+    module, _, name = env_id.rpartition(":")
+    if module:
+        import_module(module)
+    spec = gym.spec(name)
     if spec.entry_point != _POINT_MAZE:
         return make_sb3_vec_env(env_id, n_envs, seed=seed, env_kwargs=env_kwargs)
     limit = env_kwargs.pop("max_episode_steps", spec.max_episode_steps)

@@ -239,7 +239,7 @@ class Maze:
         """
         n_rows, n_columns = self.walls.shape
         corners = np.array([[-half_size], [half_size]])
-        # No body is larger than a cell, so that a wall below it lies below one of its corners.
+        # No body is larger than a cell, so that a wall below it lies below one of its corners
         columns = ((x + (corners - self.extent[0])) * (1 / CELL_SIZE)).clip(0, n_columns - 1).astype(np.intp)
         rows = (((corners + self.extent[3]) - y) * (1 / CELL_SIZE)).clip(0, n_rows - 1).astype(np.intp)
         hits = self._flat_walls.take((rows * n_columns)[:, None] + columns[None])
@@ -267,7 +267,7 @@ class Maze:
         :param new: where they end, shape (n, 2)
         :return: pairs (segment, letter), by segment and, within one segment, in the order of crossing
         """
-        # A point on the line counts as right of it, so that touching it and turning back writes nothing.
+        # A point on the line counts as right of it
         left = new[:, :1] < self._cut_x
         changed = left != (old[:, :1] < self._cut_x)
         if not changed.any():

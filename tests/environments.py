@@ -1,0 +1,110 @@
+"""Tiny environments, models and hand-made trajectories, shared by tests."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.logger import Logger
+
+from sb3_ddiffpg import DDiffPG
+
+SMALL: dict[str, Any] = {
+    "learning_starts": 40,
+    "buffer_size": 2000,
+    "batch_size": 32,
+    "min_mode_size": 3,
+    "recluster_freq": 20,
+    "seed": 0,
+    "policy_kwargs": {"net_arch": [16]},
+}
+
+
+def small_model(env: Any, policy: str = "MlpPolicy", **changes: Any) -> DDiffPG:
+    """A model that learns little, but fast, and writes no logs."""
+    model = DDiffPG(policy, env, **(SMALL | changes))
+    model.set_logger(Logger(None, []))
+    return model
+
+
+class TwoEnds(gym.Env):
+    """A point on a line with a goal at either end: two ways, both found by chance within a few episodes."""
+
+    def __init__(self, success_key: str | None = "is_success", limit: int = 8) -> None:
+        self.observation_space = spaces.Box(-2.0, 2.0, (2,))
+        self.action_space = spaces.Box(-1.0, 1.0, (1,))
+        self.mode_features = np.array([0])
+        self.success_key, self.limit = success_key, limit
+        self.x, self.steps = 0.0, 0
+
+    def _observation(self) -> np.ndarray:
+        return np.array([self.x, self.steps / self.limit], dtype=np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.x, self.steps = float(self.np_random.uniform(-0.1, 0.1)), 0
+        return self._observation(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.x += 0.5 * float(action[0])
+        self.steps += 1
+        reached = abs(self.x) >= 1
+        info = {} if self.success_key is None else {self.success_key: reached}
+        return self._observation(), float(reached), reached, self.steps >= self.limit, info
+
+
+class AnySpaces(gym.Env):
+    """Random observations of any space; an action is rewarded by its first component."""
+
+    def __init__(
+        self, observation_space: spaces.Space | None = None, action_space: spaces.Box | None = None, limit: int = 10
+    ) -> None:
+        self.observation_space = spaces.Box(-1.0, 1.0, (2,)) if observation_space is None else observation_space
+        self.action_space = spaces.Box(-1.0, 1.0, (2,)) if action_space is None else action_space
+        self.limit, self.steps = limit, 0
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
+        if seed is not None:
+            self.observation_space.seed(seed)
+        self.steps = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict]:
+        assert self.action_space.contains(action)
+        self.steps += 1
+        return self.observation_space.sample(), float(np.ravel(action)[0]), False, self.steps >= self.limit, {}
+
+
+class BreaksAt(gym.Wrapper):
+    """Gives NaN for the ``part`` of the ``when``-th step (or reset), counted over episodes from 1, and only then."""
+
+    def __init__(self, env: gym.Env, part: str, when: int) -> None:
+        super().__init__(env)
+        self.part, self.when, self.count = part, when, 0
+
+    def _breaks(self, here: bool) -> bool:
+        self.count += here
+        return here and self.count == self.when
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict]:
+        observation, info = self.env.reset(**kwargs)
+        return (observation * np.nan if self._breaks(self.part == "reset") else observation), info
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict]:
+        assert np.isfinite(action).all(), "a simulator must not be given NaN"
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if self._breaks(self.part != "reset"):
+            observation, reward = (observation * np.nan, reward) if self.part == "observation" else (observation, np.nan)
+        return observation, reward, terminated, truncated, info
+
+
+def image_dict_space(channel_last: bool = False) -> spaces.Dict:
+    """An image, a vector and a number, as SB3's tests of dict observations use them."""
+    shape = (36, 36, 1) if channel_last else (1, 36, 36)
+    return spaces.Dict(
+        {
+            "img": spaces.Box(0, 255, shape, dtype=np.uint8),
+            "vec": spaces.Box(-1.0, 1.0, (2,)),
+            "discrete": spaces.Discrete(4),
+        }
+    )
