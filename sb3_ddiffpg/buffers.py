@@ -6,14 +6,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from scipy.spatial.distance import cdist
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_ddiffpg.clustering import resample_path
+from sb3_ddiffpg.dtw import erase_loops, resample_path
 from sb3_ddiffpg.features import ModeFeatures, Observation
 from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, SuccessRule, Trajectory
+
+EXPLORATORY = 0  # the first group of a batch
 
 
 class ModeBatch(NamedTuple):
@@ -80,7 +83,11 @@ class ModeReplayBuffer(ReplayBuffer):
         success_key: str | None = None,
         max_successes_per_mode: int = 40,
         max_failures_per_mode: int = 20,
+        max_length_ratio: float = 1.5,
+        min_direct: int = 5,
         n_path_points: int = 48,
+        loop_share: float = 0.05,
+        route_share: float = 0.1,
     ) -> None:
         if optimize_memory_usage:
             raise ValueError("optimize_memory_usage=True is not supported: trajectories do not lie in one ring")
@@ -101,7 +108,11 @@ class ModeReplayBuffer(ReplayBuffer):
         self.success_key = success_key
         self.max_successes_per_mode = max_successes_per_mode
         self.max_failures_per_mode = max_failures_per_mode
+        self.max_length_ratio = max_length_ratio
+        self.min_direct = min_direct
         self.n_path_points = n_path_points
+        self.loop_share = loop_share
+        self.route_share = route_share
         self.reset()
 
     # ------------------------------------------------------------------ storage
@@ -123,13 +134,14 @@ class ModeReplayBuffer(ReplayBuffer):
         self._success_rule = SuccessRule(self.success_key)
         self._feature_scale: np.ndarray | None = None
         self._distances = DistanceCache()
+        self._mode_position = np.empty(0, dtype=np.int32)
         self.just_finished: list[tuple[int, Trajectory]] = []
         self.mode_rows: list[RowSet] = []
 
     def _row_arrays(self) -> list[str]:
         return [
             *("observations", "next_observations", "actions", "target_actions", "exploratory_target_actions"),
-            *("rewards", "dones", "timeouts", "next_row", "_all_position", "_mode_position"),
+            *("rewards", "off_route", "dones", "timeouts", "next_row", "_all_position", "_mode_position"),
         ]
 
     def _allocate(self) -> None:
@@ -137,7 +149,7 @@ class ModeReplayBuffer(ReplayBuffer):
 
         def zeros_like_space(space: spaces.Space) -> np.ndarray:
             shape = get_obs_shape(space)
-            return np.zeros((self.buffer_size, *shape), dtype=self._maybe_cast_dtype(space.dtype))  # type: ignore[misc]
+            return np.zeros((self.buffer_size, *shape), dtype=self._maybe_cast_dtype(space.dtype))
 
         if isinstance(self.observation_space, spaces.Dict):
             self.observations = {key: zeros_like_space(space) for key, space in self.observation_space.items()}
@@ -148,12 +160,15 @@ class ModeReplayBuffer(ReplayBuffer):
         for name in ("actions", "target_actions", "exploratory_target_actions"):
             setattr(self, name, np.zeros((self.buffer_size, self.action_dim), dtype=np.float32))
         self.rewards = np.zeros(self.buffer_size, dtype=np.float32)
+        self.off_route = np.zeros(self.buffer_size, dtype=bool)
         self.dones = np.zeros(self.buffer_size, dtype=bool)
         self.timeouts = np.zeros(self.buffer_size, dtype=bool)
         self.next_row = np.zeros(self.buffer_size, dtype=np.int32)
         self._all_position = np.zeros(self.buffer_size, dtype=np.int32)
         self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
         self._all = RowSet(self._all_position)
+        for row_set in self.mode_rows:
+            row_set.position = self._mode_position
         self._allocated = True
 
     def __getstate__(self) -> dict[str, Any]:
@@ -171,7 +186,7 @@ class ModeReplayBuffer(ReplayBuffer):
         if not self._allocated:
             return
         saved = {name: state[name] for name in self._row_arrays()}
-        all_rows, mode_rows = self._all, self.mode_rows
+        all_rows = self._all
         self._allocate()
         for name, array in saved.items():
             target = getattr(self, name)
@@ -181,10 +196,8 @@ class ModeReplayBuffer(ReplayBuffer):
                 strict=True,
             ):
                 full[: self.pos] = used
-        self._all, self.mode_rows = all_rows, mode_rows
+        self._all = all_rows
         self._all.position = self._all_position
-        for row_set in self.mode_rows:
-            row_set.position = self._mode_position
 
     def size(self) -> int:
         """
@@ -220,7 +233,7 @@ class ModeReplayBuffer(ReplayBuffer):
             trajectory = self._groups[largest].popleft()
             self._group_rows[largest] -= trajectory.length
         self._free_rows(trajectory.rows)
-        if trajectory.mode != NO_MODE:
+        if trajectory.trains:
             self.mode_rows[trajectory.mode].remove(trajectory.rows)
 
     def _free_rows(self, rows: np.ndarray) -> None:
@@ -263,6 +276,7 @@ class ModeReplayBuffer(ReplayBuffer):
         self._write(self.next_observations, rows, next_obs)
         self.actions[rows] = self.target_actions[rows] = self.exploratory_target_actions[rows] = action
         self.rewards[rows] = reward
+        self.off_route[rows] = False
         self.dones[rows] = done
         self.timeouts[rows] = False
         self.next_row[rows] = -1
@@ -317,7 +331,7 @@ class ModeReplayBuffer(ReplayBuffer):
         return trajectory
 
     def _insert(self, trajectory: Trajectory) -> None:
-        key = (trajectory.mode, trajectory.success)
+        key = (trajectory.mode, trajectory.success and not trajectory.foreign)
         self._groups.setdefault(key, deque()).append(trajectory)
         self._group_rows[key] = self._group_rows.get(key, 0) + trajectory.length
 
@@ -336,9 +350,24 @@ class ModeReplayBuffer(ReplayBuffer):
 
     # ------------------------------------------------------------------ modes
 
+    @property
+    def has_success_signal(self) -> bool:
+        """Whether the environment itself says what a success is."""
+        return self._success_rule.has_signal
+
+    def expect_modes(self, n_modes: int) -> None:
+        """
+        Forget which mode owns what: until the next clustering, a model's modes have no trajectories here.
+
+        :param n_modes: Number of modes of the model
+        """
+        successes, failures = self.trajectories(success=True), self.trajectories(success=False)
+        nobody = np.full(len(successes), NO_MODE), np.full(len(failures), NO_MODE)
+        self.assign_modes(successes, nobody[0], failures, nobody[1], [None] * n_modes)
+
     def trajectories(self, success: bool) -> list[Trajectory]:
         """
-        :param success: Goal-reached or failed ones
+        :param success: Goal-reached or failed ones (and those foreign to their mode)
         :return: Those in use by a mode or not yet clustered, in order of finishing
         """
         found = [t for key, group in self._groups.items() if key[1] == success for t in group]
@@ -360,7 +389,9 @@ class ModeReplayBuffer(ReplayBuffer):
         """
         if self._feature_scale is None:
             self._feature_scale = self._measure_scale()
-        return resample_path(full_path / self._feature_scale, self.n_path_points)
+        path = full_path / self._feature_scale
+        path = erase_loops(path, self.loop_share * float(np.linalg.norm(np.ptp(path, axis=0))))
+        return resample_path(path, self.n_path_points)
 
     def full_path(self, trajectory: Trajectory) -> np.ndarray:
         """
@@ -398,39 +429,77 @@ class ModeReplayBuffer(ReplayBuffer):
         parents: list[int | None],
     ) -> None:
         """
-        Hand the trajectories to their new modes and rebuild the modes' rows. Each mode keeps its newest successes and
-        failures; the rest, and outliers beyond one mode's share, retire to exploration.
+        Hand the trajectories to their new modes and rebuild the modes' rows. Each mode learns from its newest direct successes
+        and its newest failures, and remembers as many detours for the next clustering; the rest retires to exploration.
 
         :param successes: In order of finishing
         :param success_modes: New mode of each, ``NO_MODE`` for outliers
-        :param failures: In order of finishing
+        :param failures: In order of finishing; foreign ones count as failures of their mode
         :param failure_modes: New mode of each
         :param parents: For every new mode, the old mode from which it inherits. A trajectory that comes from another lineage
             starts again with its action as target action
         """
         self._groups, self._group_rows = {}, {}
         self.mode_rows = [RowSet(self._mode_position) for _ in parents]
-        kept: list[Trajectory] = []
-        retired: list[Trajectory] = []
+        stays: list[Trajectory] = []
+        goes: list[Trajectory] = []
         for trajectories, modes, limit in (
             (successes, success_modes, self.max_successes_per_mode),
             (failures, failure_modes, self.max_failures_per_mode),
         ):
-            taken: dict[int, int] = {}
-            for trajectory, mode in zip(reversed(trajectories), reversed(np.asarray(modes, dtype=int).tolist()), strict=True):
-                taken[mode] = taken.get(mode, 0) + 1
-                inherited = trajectory.mode == NO_MODE or (mode != NO_MODE and parents[mode] == trajectory.mode)
-                if not inherited:
-                    self.target_actions[trajectory.rows] = self.actions[trajectory.rows]
-                trajectory.mode = mode if taken[mode] <= limit else NO_MODE
-                (kept if taken[mode] <= limit else retired).append(trajectory)
-        for trajectory in sorted(kept, key=lambda t: t.serial):
+            for mode in range(NO_MODE, len(parents)):
+                members = [trajectories[i] for i in np.flatnonzero(np.asarray(modes) == mode)]
+                direct, detours = ([], members) if mode == NO_MODE else self._split_detours(members)
+                for trajectory in members:
+                    trajectory.trains = False
+                for trajectory in direct[-limit:]:
+                    trajectory.trains = True
+                kept = [*direct[-limit:], *detours[-limit:]]
+                dropped = [*direct[:-limit], *detours[:-limit]]
+                for trajectory in members:
+                    self._change_mode(trajectory, mode, parents)
+                stays += kept
+                goes += dropped
+        for trajectory in sorted(stays, key=lambda t: t.serial):
             self._insert(trajectory)
-            if trajectory.mode != NO_MODE:
+            if trajectory.trains:
                 self.mode_rows[trajectory.mode].add(trajectory.rows)
-        for trajectory in retired:
-            trajectory.path = None
-        self._retired.extend(sorted(retired, key=lambda t: t.serial))
+        for trajectory in sorted(goes, key=lambda t: t.serial):
+            trajectory.mode, trajectory.path = NO_MODE, None
+            self._retired.append(trajectory)
+
+    def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:
+        """
+        A mode's trajectories, and apart from them the successes that are much longer than its shortest one. From detours a
+        critic would piece together a better way than the mode's own route, and the modes would become one.
+        """
+        lengths = np.sort([t.length for t in trajectories if t.success and not t.foreign])
+        if not len(lengths):
+            return trajectories, []
+        limit = max(self.max_length_ratio * lengths[0], lengths[: self.min_direct][-1])
+        is_detour = [t.success and not t.foreign and t.length > limit for t in trajectories]
+        direct = [t for t, detour in zip(trajectories, is_detour, strict=True) if not detour]
+        return direct, [t for t, detour in zip(trajectories, is_detour, strict=True) if detour]
+
+    def mark_off_route(self, trajectory: Trajectory, members: list[Trajectory]) -> None:
+        """
+        Mark the steps of a foreign trajectory that lead away from the route of the mode that it was told to follow.
+
+        :param trajectory: The foreign trajectory
+        :param members: Goal-reached trajectories of that mode
+        """
+        trajectory.foreign = True
+        route = np.concatenate([self.path(member) for member in members])
+        reached = self.full_path(trajectory)[1:] / self._feature_scale
+        radius = self.route_share * float(np.linalg.norm(np.ptp(route, axis=0)))
+        self.off_route[trajectory.rows] = cdist(reached, route).min(axis=1) > radius
+
+    def _change_mode(self, trajectory: Trajectory, mode: int, parents: list[int | None]) -> None:
+        """Target actions are inherited with the critics that made them, or start again from the action."""
+        inherited = trajectory.mode == NO_MODE or (mode != NO_MODE and parents[mode] == trajectory.mode)
+        if not inherited:
+            self.target_actions[trajectory.rows] = self.actions[trajectory.rows]
+        trajectory.mode = mode
 
     # ------------------------------------------------------------------ sampling
 
@@ -491,10 +560,14 @@ class ModeReplayBuffer(ReplayBuffer):
         present = windows >= 0
         powers = np.float32(gamma) ** np.arange(windows.shape[-1], dtype=np.float32)
         rewards = self._normalize_reward(self.rewards[windows.ravel()], env).reshape(windows.shape)
-        rewards = (np.where(present, rewards, 0.0) * powers).sum(axis=-1)  # [G, n]
+        # For its mode a step off the route ends the episode without reward, so that no way back is worth anything
+        lost = np.logical_or.accumulate(self.off_route[windows] & present, axis=-1)
+        lost[EXPLORATORY] = False
+        rewards = (np.where(present & ~lost, rewards, 0.0) * powers).sum(axis=-1)  # [G, n]
         lengths = present.sum(axis=-1)
         last = np.take_along_axis(windows, lengths[..., None] - 1, axis=-1)[..., 0]
-        discounts = np.float32(gamma) ** lengths * (~self.dones[last] | self.timeouts[last])
+        continues = (~self.dones[last] | self.timeouts[last]) & ~lost.any(axis=-1)
+        discounts = np.float32(gamma) ** lengths * continues
         obs = self._normalize_obs(self._read(self.observations, rows.ravel()), env)
         next_obs = self._normalize_obs(self._read(self.next_observations, last.ravel()), env)
         targets = np.concatenate((self.exploratory_target_actions[rows[:1]], self.target_actions[rows[1:]]))

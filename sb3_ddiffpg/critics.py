@@ -188,7 +188,8 @@ class ModeCritics(nn.Module):
                 if state is None:
                     continue
                 for name, value in state.items():
-                    if value.shape == old.shape:  # the moments; the step count is shared by all groups
+                    # The moments; the step count is shared by all groups
+                    if isinstance(value, th.Tensor) and value.shape == old.shape:
                         state[name] = value[source].clone()
                         state[name][restart] = 0.0
                 optimizer.state[new] = state

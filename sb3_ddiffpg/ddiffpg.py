@@ -1,5 +1,6 @@
 """Deep Diffusion Policy Gradient: the algorithm."""
 
+import contextlib
 import io
 import pathlib
 import time
@@ -67,8 +68,7 @@ class DDiffPG(OffPolicyAlgorithm):
     :param n_atoms: Atoms of the critics' value distribution (C51); 1 for scalar critics
     :param v_min: Lower end of the values' support
     :param v_max: Upper end of the support of the modes' critics
-    :param exploration_v_max: Upper end of the support of the exploratory critics (lower end: minus that when
-        ``normalize_intrinsic``, else 0)
+    :param exploration_v_max: Upper end of the support of the exploratory critics (the lower end is 0)
     :param reward_scale: Factor on the environment's reward
     :param mode_n_steps: Length of the multi-step returns of the modes' critics (uncorrected)
     :param exploration_n_steps: The same for the exploratory critics
@@ -82,6 +82,7 @@ class DDiffPG(OffPolicyAlgorithm):
     :param linkage: Linkage of the hierarchical clustering, as in ``scipy.cluster.hierarchy.linkage``
     :param max_modes: Most modes at a time; 1 turns clustering off
     :param min_mode_size: Fewest goal-reached trajectories that make a mode
+    :param mode_patience: Re-clusterings in a row that must find no cluster for a mode before it is merged or retired
     :param max_successes_per_mode: Newest goal-reached trajectories that train a mode
     :param max_failures_per_mode: Newest failed trajectories that train a mode
     :param mode_embedding_dim: Size of a mode embedding
@@ -93,12 +94,14 @@ class DDiffPG(OffPolicyAlgorithm):
     :param exploration_share: Share of episodes that explore, a float or a function of the remaining progress. None:
         ``1 / (M + 1)`` until ``exploration_fraction`` of the training, then 0; always 1 while there is no mode
     :param exploration_fraction: Part of the training that explores, when ``exploration_share`` is None
+    :param explore_then_exploit: Whether an exploring episode hands over to a mode or the zero embedding after a random time
+        (on average the modes' mean length), so that it comes to a goal by a way that no mode would have taken
     :param novelty: ``"rnd"``, ``"counts"``, or a class with the methods of ``RandomNetworkDistillation``
     :param novelty_kwargs: Further keyword arguments of the novelty measure
     :param novelty_scale: The factor alpha of NovelD
     :param intrinsic_coef: Factor c on the intrinsic reward
     :param mode_intrinsic_coef: Factor on the intrinsic reward that is added to the modes' rewards
-    :param normalize_intrinsic: Whether the intrinsic reward is standardised by its running mean and deviation
+    :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
     :param max_grad_norm: Largest gradient norm of the policy and of each mode's critics
@@ -147,7 +150,7 @@ class DDiffPG(OffPolicyAlgorithm):
         n_atoms: int = 51,
         v_min: float = 0.0,
         v_max: float = 5.0,
-        exploration_v_max: float = 5.0,
+        exploration_v_max: float = 10.0,
         reward_scale: float = 1.0,
         mode_n_steps: int = 5,
         exploration_n_steps: int = 1,
@@ -159,6 +162,7 @@ class DDiffPG(OffPolicyAlgorithm):
         linkage: str = "average",
         max_modes: int = 10,
         min_mode_size: int = 5,
+        mode_patience: int = 10,
         max_successes_per_mode: int = 40,
         max_failures_per_mode: int = 20,
         mode_embedding_dim: int = 5,
@@ -167,10 +171,11 @@ class DDiffPG(OffPolicyAlgorithm):
         success_key: str | None = None,
         exploration_share: float | Schedule | None = None,
         exploration_fraction: float = 0.7,
+        explore_then_exploit: bool = True,
         novelty: str | type = "counts",
         novelty_kwargs: dict[str, Any] | None = None,
         novelty_scale: float = 0.5,
-        intrinsic_coef: float = 0.1,
+        intrinsic_coef: float = 0.05,
         mode_intrinsic_coef: float = 0.0,
         normalize_intrinsic: bool = True,
         reset_new_critics: bool = True,
@@ -230,6 +235,7 @@ class DDiffPG(OffPolicyAlgorithm):
         self.linkage = linkage
         self.max_modes = max_modes
         self.min_mode_size = min_mode_size
+        self.mode_patience = mode_patience
         self.max_successes_per_mode = max_successes_per_mode
         self.max_failures_per_mode = max_failures_per_mode
         self.mode_embedding_dim = mode_embedding_dim
@@ -238,6 +244,7 @@ class DDiffPG(OffPolicyAlgorithm):
         self.success_key = success_key
         self.exploration_share = exploration_share
         self.exploration_fraction = exploration_fraction
+        self.explore_then_exploit = explore_then_exploit
         self.novelty = novelty
         self.novelty_kwargs = novelty_kwargs
         self.novelty_scale = novelty_scale
@@ -252,6 +259,7 @@ class DDiffPG(OffPolicyAlgorithm):
         self._modes: list[Mode] = []
         self._next_mode_number = 0
         self._env_groups = np.zeros(0, dtype=np.int64)  # the row of the embedding table that drives each environment
+        self._env_handed_over = np.zeros(0, dtype=bool)
         self._rotation = 0
         self._resolved_features: Any = None
         self._warned_support = False
@@ -275,7 +283,7 @@ class DDiffPG(OffPolicyAlgorithm):
             "n_critics": self.n_critics,
             "n_atoms": self.n_atoms,
             "support": (self.v_min, self.v_max),
-            "exploration_support": self._exploration_support(),
+            "exploration_support": (0.0, self.exploration_v_max),
             **self.policy_kwargs,
         }
         self.replay_buffer_kwargs = {
@@ -289,8 +297,13 @@ class DDiffPG(OffPolicyAlgorithm):
             super()._setup_model()
         finally:
             self.policy_kwargs, self.replay_buffer_kwargs = given
-        if self.action_noise is None:
-            self.action_noise = SpreadNormalActionNoise(self.n_envs, int(np.prod(self.action_space.shape or (1,))))
+        self.replay_buffer.expect_modes(len(self._modes))
+        noise = self.action_noise
+        if noise is None or (isinstance(noise, SpreadNormalActionNoise) and noise.shape[0] != self.n_envs):
+            # None given, or loaded with another number of environments
+            deviations = {} if noise is None else {"low": noise.low, "high": noise.high}
+            action_dim = int(np.prod(self.action_space.shape or (1,)))
+            self.action_noise = SpreadNormalActionNoise(self.n_envs, action_dim, **deviations)
         measure = NOVELTY_MEASURES[self.novelty] if isinstance(self.novelty, str) else self.novelty
         self.novelty_model: Any = measure(
             self.replay_buffer.features.dim, self.policy.actor.features_dim, **(self.novelty_kwargs or {})
@@ -299,17 +312,14 @@ class DDiffPG(OffPolicyAlgorithm):
         self._qf_schedule = self.lr_schedule if self.qf_learning_rate is None else FloatSchedule(self.qf_learning_rate)
         self._create_aliases()
 
-    def _exploration_support(self) -> tuple[float, float]:
-        # A standardised reward is negative where nothing is new
-        return (-self.exploration_v_max if self.normalize_intrinsic else 0.0, self.exploration_v_max)
-
     def _resolve_mode_features(self) -> None:
         if self.mode_features is not None:
             self._resolved_features = self.mode_features
         elif self.env is not None:
-            try:
+            # Asked first: a worker process would die of an attribute that its environment does not have
+            if self.env.has_attr("mode_features"):
                 self._resolved_features = self.env.get_attr("mode_features", indices=0)[0]
-            except AttributeError:
+            else:
                 is_goal_env = (
                     isinstance(self.observation_space, spaces.Dict) and "achieved_goal" in self.observation_space.spaces
                 )
@@ -381,20 +391,22 @@ class DDiffPG(OffPolicyAlgorithm):
         :param metrics: Where to note the mean and the loss
         :return: [G, n]
         """
-        rows = windows.clip(min=0).ravel()
-        inputs = [self._novelty_inputs(obs) for obs in self.replay_buffer.read_observations(rows)]
+        present = windows >= 0
+        inputs = [self._novelty_inputs(obs) for obs in self.replay_buffer.read_observations(windows[present])]
         now, then = (self.novelty_model.novelty(*each) for each in inputs)
         reward = noveld_reward(now, then, self.novelty_scale)
         metrics["intrinsic_reward"].append(reward.mean())
         if self.normalize_intrinsic:
             self.intrinsic_moments.update(reward[:, None])
-            # Without limits one surprising state would dominate the values for long
-            reward = self.intrinsic_moments.standardize(reward[:, None])[:, 0].clamp(-2.0, 8.0)
+            # Not centred: where nothing is new, a negative reward would make it worth while to end the episode at a goal.
+            # Limited: one surprising state would dominate the values for long
+            reward = (reward / (self.intrinsic_moments.var.sqrt() + 1e-8)).clamp(max=10.0)
         if self.novelty_model.optimizer is not None:
             metrics["novelty_loss"].append(self.novelty_model.update(*inputs[1]))
-        steps = th.arange(windows.shape[-1], device=self.device)
-        weights = self.intrinsic_coef * self.gamma**steps * th.as_tensor(windows >= 0, device=self.device)
-        return (reward.view(windows.shape) * weights).sum(dim=-1).float()
+        rewards = reward.new_zeros(windows.shape)
+        rewards[th.as_tensor(present, device=self.device)] = reward
+        discounts = self.gamma ** th.arange(windows.shape[-1], device=self.device)
+        return self.intrinsic_coef * (rewards * discounts).sum(dim=-1).float()
 
     def _novelty_inputs(self, obs: Any) -> tuple[th.Tensor, th.Tensor]:
         """Positions [N, position_dim] and scaled features [N, features_dim] of raw observations."""
@@ -469,7 +481,10 @@ class DDiffPG(OffPolicyAlgorithm):
         polyak_update(
             policy.critic_features_extractor.parameters(), policy.critic_features_extractor_target.parameters(), self.tau
         )
-        polyak_update(policy.critic_features_extractor.buffers(), policy.critic_features_extractor_target.buffers(), 1.0)
+        # Running statistics of a batch norm are copied, as in SB3
+        statistics = policy.critic_features_extractor.buffers(), policy.critic_features_extractor_target.buffers()
+        for online, target in zip(*statistics, strict=True):
+            target.copy_(online)
 
     def _update_learning_rates(self) -> None:
         progress = self._current_progress_remaining
@@ -490,7 +505,9 @@ class DDiffPG(OffPolicyAlgorithm):
         :return: One entry for every mode that was born, split, merged or retired
         """
         started = time.perf_counter()
-        found = find_modes(self.replay_buffer, self._modes, self._cluster, self.min_mode_size)
+        found = find_modes(
+            self.replay_buffer, self._modes, self._cluster, self.min_mode_size, self.max_modes, self.mode_patience
+        )
         if found is None:
             return []
         parents, kept = found.inheritance.parents, found.inheritance.kept
@@ -558,6 +575,7 @@ class DDiffPG(OffPolicyAlgorithm):
         if self.num_timesteps < learning_starts:
             scaled_action = np.random.uniform(-1.0, 1.0, size=shape).astype(np.float32)
         else:
+            self._hand_over()
             action, _ = self.policy.predict(self._last_obs, group=self._env_groups)
             scaled_action = self.policy.scale_action(action)
             if action_noise is not None:
@@ -568,9 +586,22 @@ class DDiffPG(OffPolicyAlgorithm):
         """What drives an environment through its next episode: exploration, or the modes and the zero embedding in turn."""
         if not self._modes or np.random.rand() < self._exploration_share():
             return EXPLORATORY_GROUP
+        return self._next_in_turn()
+
+    def _next_in_turn(self) -> int:
         self._rotation += 1
         turn = self._rotation % (len(self._modes) + 1)
         return UNCONDITIONED if turn == 0 else turn
+
+    def _hand_over(self) -> None:
+        """End the exploring part of some episodes: at every step with probability one by the modes' mean length."""
+        lengths = [mode.mean_length for mode in self._modes if mode.n_trajectories]
+        if not lengths or not self.explore_then_exploit:
+            return
+        leaves = (self._env_groups == EXPLORATORY_GROUP) & (np.random.rand(self.n_envs) < 1 / np.mean(lengths))
+        for env in np.flatnonzero(leaves):
+            self._env_groups[env] = self._next_in_turn()
+            self._env_handed_over[env] = True
 
     def _exploration_share(self) -> float:
         progress_remaining = self._current_progress_remaining
@@ -584,10 +615,12 @@ class DDiffPG(OffPolicyAlgorithm):
         self.novelty_model.observe(positions)
         for env, trajectory in replay_buffer.just_finished:
             group = int(self._env_groups[env])
-            if group > EXPLORATORY_GROUP:
+            if group > EXPLORATORY_GROUP and not self._env_handed_over[env]:
+                trajectory.commanded = self._modes[group - 1].name
                 self._modes[group - 1].outcomes.append(trajectory.success)
             self._warn_outside_support(trajectory)
             self._env_groups[env] = self._draw_group()
+            self._env_handed_over[env] = False
 
     def _warn_outside_support(self, trajectory: Trajectory) -> None:
         """Once: values that the critics cannot represent make all actions look alike."""
@@ -616,7 +649,12 @@ class DDiffPG(OffPolicyAlgorithm):
         """
         Train the model. See SB3's ``learn``; ``log_interval`` counts episodes of all environments.
         """
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        # Denormal numbers in Adam's moments slow a small update down by half
+        th.set_flush_denormal(True)
+        try:
+            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        finally:
+            th.set_flush_denormal(False)
 
     def _setup_learn(
         self,
@@ -628,11 +666,10 @@ class DDiffPG(OffPolicyAlgorithm):
     ) -> tuple[int, BaseCallback]:
         assert self.env is not None, "You must set the environment before calling learn()"
         self._check_buffer(self.env)
-        # Denormal numbers in Adam's moments slow a small update down by half
-        th.set_flush_denormal(True)
         if reset_num_timesteps or self._last_obs is None:
             self.replay_buffer.drop_unfinished_episodes()
             self._env_groups = np.array([self._draw_group() for _ in range(self.n_envs)], dtype=np.int64)
+            self._env_handed_over = np.zeros(self.n_envs, dtype=bool)
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _check_buffer(self, env: VecEnv) -> None:
@@ -682,15 +719,24 @@ class DDiffPG(OffPolicyAlgorithm):
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
         """
-        See SB3. The number of modes follows the given parameters.
+        See SB3. The number of modes follows the given parameters; if it changes, nobody knows which modes these are: they
+        get new names and wait for trajectories.
         """
         params: Any = load_path_or_dict
         if not isinstance(params, dict):
             _, params, _ = load_from_zip_file(params, device=device, load_data=False)
         embeddings = params.get("policy", {}).get("mode_embeddings")
-        if embeddings is not None:
-            self.policy.resize(len(embeddings) - 1)
+        if embeddings is not None and len(embeddings) - 1 != len(self._modes):
+            self._expect_unknown_modes(len(embeddings) - 1)
         super().set_parameters(params, exact_match, device)
+
+    def _expect_unknown_modes(self, n_modes: int) -> None:
+        self.policy.resize(n_modes)
+        first = self._next_mode_number
+        self._modes = [Mode(name=f"mode_{first + index}", born_at=self.num_timesteps) for index in range(n_modes)]
+        self._next_mode_number += n_modes
+        self._env_groups[self._env_groups > EXPLORATORY_GROUP] = UNCONDITIONED
+        self.replay_buffer.expect_modes(n_modes)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
@@ -701,8 +747,9 @@ class DDiffPG(OffPolicyAlgorithm):
         :raises ValueError: If it is no ``ModeReplayBuffer``, or holds other modes than the model
         """
         previous = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        loaded = self.replay_buffer
+        with contextlib.suppress(AssertionError):  # SB3's, for anything but a replay buffer
+            super().load_replay_buffer(path, truncate_last_traj)
+        loaded: Any = self.replay_buffer
         problem = None
         if not isinstance(loaded, ModeReplayBuffer):
             problem = f"is a {type(loaded).__name__}, not a ModeReplayBuffer"

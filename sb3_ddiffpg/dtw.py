@@ -13,6 +13,24 @@ LANES = 16
 _FLOAT_FLAGS = {"contract", "nnan", "nsz"}
 
 
+def erase_loops(path: np.ndarray, radius: float) -> np.ndarray:
+    """
+    The path without its loops: from each point it goes on where the path was last within ``radius`` of that point. Wandering
+    on the way says nothing about the way.
+
+    :param path: shape ``[length, dims]``
+    :param radius: in the unit of the path
+    :return: shape ``[at most length, dims]``; begins and ends as the path does
+    """
+    squared = ((path[:, None, :] - path[None, :, :]) ** 2).sum(axis=2)
+    last_near = len(path) - 1 - (squared <= radius**2)[:, ::-1].argmax(axis=1)
+    kept = [0]
+    while kept[-1] < len(path) - 1:
+        current = kept[-1]
+        kept.append(int(max(last_near[current], current + 1)))
+    return path[kept]
+
+
 def resample_path(path: np.ndarray, n_points: int) -> np.ndarray:
     """
     Points at equal distances of arc length along the polyline through ``path``: what is left of a trajectory when

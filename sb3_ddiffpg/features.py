@@ -32,8 +32,8 @@ class ScaledFlattenExtractor(BaseFeaturesExtractor):
         if isinstance(observation_space, spaces.Box) and not is_image_space(observation_space):
             low, high = observation_space.low.ravel().astype(np.float64), observation_space.high.ravel().astype(np.float64)
             bounded = (np.abs(low) < LARGEST_USEFUL_BOUND) & (np.abs(high) < LARGEST_USEFUL_BOUND) & (low < high)
-            offset[bounded] = (low + high)[bounded] / 2
-            scale[bounded] = 2 / (high - low)[bounded]
+            offset[bounded] = (low[bounded] + high[bounded]) / 2
+            scale[bounded] = 2 / (high[bounded] - low[bounded])
         self.register_buffer("offset", th.as_tensor(offset, dtype=th.float32), persistent=False)
         self.register_buffer("scale", th.as_tensor(scale, dtype=th.float32), persistent=False)
 

@@ -31,7 +31,7 @@ def plot_routes(episodes: Mapping[str, Sequence[EpisodeResult]], maze: Any = Non
             style = "-" if run.success else "--"
             axes.plot(run.path[:, 0], run.path[:, 1], style, color=color, alpha=0.35, lw=1, label=None if i else name)
     legend = figure.legend(loc="outside right upper")
-    for handle in legend.legend_handles:
+    for handle in filter(None, legend.legend_handles):
         handle.set_alpha(1.0)
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")

@@ -228,6 +228,7 @@ class DiffusionPolicy(BasePolicy):
         self.critics.optimizer = make(parameters, lr=lr_schedule(1), **optimizer_kwargs)
         self._embeddings_in_use: th.Tensor | None = None
         self.critics_target.train(False)
+        self.critic_features_extractor_target.train(False)
 
     @property
     def n_modes(self) -> int:
@@ -328,21 +329,25 @@ class DiffusionPolicy(BasePolicy):
         :param group: Rows of the embedding table, overrides ``mode``; for training
         :return: The actions in the action space's bounds, and the state for the next call
         """
+        held = None
         if group is None and mode is not None:
-            modes = np.atleast_1d(np.asarray(mode))
-            if modes.size and (modes.min() < 0 or modes.max() >= self.n_modes):
+            held = np.atleast_1d(np.asarray(mode))
+            if held.size and (held.min() < 0 or held.max() >= self.n_modes):
                 raise ValueError(f"mode={mode!r} is unknown; this policy has {self.n_modes} modes, numbered from 0")
-            group = modes + 1
-            state = (modes,)
         elif group is None and (state is not None or episode_start is not None):
             held = self._draw_modes(state, episode_start)
-            group, state = held + 1, (held,)
-            group[held < 0] = UNCONDITIONED
+        if held is not None:
+            group = np.where(held < 0, UNCONDITIONED, held + 1)
         self._embeddings_in_use = None
-        if group is not None:
+        # A tuple is the mistake that SB3's predict explains
+        if group is not None and not isinstance(observation, tuple):
             n_obs = self.obs_to_tensor(observation)[0]
             n_rows = len(next(iter(n_obs.values())) if isinstance(n_obs, dict) else n_obs)
+            if len(group) not in (1, n_rows):
+                raise ValueError(f"Got modes, state or episode_start of {len(group)} for {n_rows} observation(s)")
             self._embeddings_in_use = self.group_embeddings(np.broadcast_to(group, (n_rows,)).copy())
+            if held is not None:
+                state = (np.broadcast_to(held, (n_rows,)).copy(),)
         try:
             return super().predict(observation, state, episode_start, deterministic)
         finally:

@@ -14,7 +14,7 @@ from sb3_ddiffpg.trajectories import NO_MODE, Trajectory
 @dataclass(frozen=True)
 class Reclustering:
     """
-    Outcome of one re-clustering; nothing is changed yet.
+    Outcome of one re-clustering. But for the marks of foreign trajectories nothing is changed yet.
 
     :param successes: The goal-reached trajectories that were clustered, N of them
     :param labels: New mode of each, ``NO_MODE`` for outliers, shape [N]
@@ -39,7 +39,7 @@ class Reclustering:
         :param buffer: Holds the trajectories
         """
         for index, mode in enumerate(modes):
-            members = [i for i in np.flatnonzero(self.labels == index) if self.successes[i].mode == index]
+            members = [i for i in np.flatnonzero(self.labels == index) if self.successes[i].trains]
             if not members:
                 continue  # dormant
             mode.n_trajectories = len(members)
@@ -50,13 +50,20 @@ class Reclustering:
 
 
 def find_modes(
-    buffer: ModeReplayBuffer, modes: Sequence[Mode], cluster: Callable[[np.ndarray], np.ndarray], min_size: int
+    buffer: ModeReplayBuffer,
+    modes: Sequence[Mode],
+    cluster: Callable[[np.ndarray], np.ndarray],
+    min_size: int,
+    max_modes: int,
+    patience: int,
 ) -> Reclustering | None:
     """
     :param buffer: Holds the trajectories
     :param modes: The modes so far
     :param cluster: Maps distances [N, N] to labels [N]
     :param min_size: Fewest goal-reached trajectories worth clustering
+    :param max_modes: Most modes at a time
+    :param patience: Re-clusterings in a row that must find no cluster for a mode before it ends
     :return: The new modes, or None when nothing could take the place of the old ones
     """
     successes, failures = buffer.trajectories(success=True), buffer.trajectories(success=False)
@@ -71,12 +78,74 @@ def find_modes(
     rng = np.random.RandomState(np.random.randint(2**31))
     dormant = _dormant(successes, len(modes))
     old_labels = _old_labels(buffer, successes, modes, dormant, rng)
-    inheritance = _with_dormant(match_modes(old_labels, labels, len(modes), n_new), dormant)
-    failure_labels = np.full(len(failures), NO_MODE)
-    if n_new and failures:
+    labels = _defend(modes, distances, old_labels, labels, patience, max_modes)
+    n_new = int(labels.max(initial=NO_MODE)) + 1
+    inheritance = _with_dormant(match_modes(old_labels, labels, len(modes), n_new), dormant, max_modes)
+    heirs = {parent: new for new, parent in enumerate(inheritance.parents) if inheritance.kept[new] and parent is not None}
+    failure_labels = np.array([heirs.get(t.mode, NO_MODE) if t.foreign else NO_MODE for t in failures], dtype=int)
+    strayed = np.flatnonzero([not failure.foreign for failure in failures])
+    if n_new and len(strayed):
         members = [[buffer.path(successes[i]) for i in np.flatnonzero(labels == mode)] for mode in range(n_new)]
-        failure_labels = assign_to_nearest([buffer.path(failure) for failure in failures], members, rng)
+        failure_labels[strayed] = assign_to_nearest([buffer.path(failures[i]) for i in strayed], members, rng)
+    if buffer.has_success_signal:
+        foreign = _foreign(modes, heirs, successes, labels)
+        for i, mode in foreign.items():
+            buffer.mark_off_route(successes[i], [successes[j] for j in np.flatnonzero(labels == mode)])
+        failures = [*failures, *(successes[i] for i in foreign)]
+        failure_labels = np.concatenate((failure_labels, list(foreign.values()))).astype(int)
+        own = np.array([i not in foreign for i in range(len(successes))], dtype=bool)
+        successes = [trajectory for trajectory, is_own in zip(successes, own, strict=True) if is_own]
+        labels, distances = labels[own], distances[np.ix_(own, own)]
     return Reclustering(successes, labels, distances, failures, failure_labels, inheritance)
+
+
+def _defend(
+    modes: Sequence[Mode],
+    distances: np.ndarray,
+    old_labels: np.ndarray,
+    labels: np.ndarray,
+    patience: int,
+    max_modes: int,
+) -> np.ndarray:
+    """
+    Labels in which a mode that was found no cluster keeps its members for a while. Near the border between one cluster and
+    two the answer changes with every new trajectory, and a mode that ends takes its critics with it.
+
+    A new trajectory in a cluster of which a part is defended goes to the mode of its nearest old one.
+    """
+    n_new = int(labels.max(initial=NO_MODE)) + 1
+    inheritance = match_modes(old_labels, labels, len(modes), n_new)
+    labels = labels.copy()
+    for old in sorted([*inheritance.merged, *inheritance.retired]):
+        members = np.flatnonzero(old_labels == old)
+        modes[old].doubts += 1
+        if modes[old].doubts > patience or n_new >= max_modes or not len(members):
+            continue
+        if old in inheritance.merged:
+            host = labels == inheritance.merged[old]
+            settled, newcomers = np.flatnonzero(host & (old_labels != NO_MODE)), np.flatnonzero(host & (old_labels == NO_MODE))
+            nearest = settled[distances[np.ix_(newcomers, settled)].argmin(axis=1)]
+            labels[newcomers[old_labels[nearest] == old]] = n_new
+        labels[members] = n_new
+        n_new += 1
+    for old in set(range(len(modes))) - set(inheritance.merged) - set(inheritance.retired):
+        modes[old].doubts = 0
+    return labels
+
+
+def _foreign(modes: Sequence[Mode], heirs: dict[int, int], successes: list[Trajectory], labels: np.ndarray) -> dict[int, int]:
+    """
+    The new trajectories that were told to follow one mode, but took the route of another: their index, and the mode that
+    they were told to follow. Seen as successes they would tell its critic that any route will do, and the policy of a
+    longer route would drift to the shorter one beside it; unseen they would tell it nothing. So it sees them as failures.
+    """
+    told = {mode.name: heirs[old] for old, mode in enumerate(modes) if old in heirs}
+    foreign: dict[int, int] = {}
+    for i, trajectory in enumerate(successes):
+        mode = told.get(trajectory.commanded or "", NO_MODE)
+        if trajectory.mode == NO_MODE and NO_MODE not in (mode, labels[i]) and mode != labels[i]:
+            foreign[i] = mode
+    return foreign
 
 
 def _dormant(successes: list[Trajectory], n_modes: int) -> list[int]:
@@ -94,6 +163,7 @@ def _old_labels(
     """Mode of every success so far. New ones are lent to the nearest dormant mode, so that it may find itself again."""
     labels = np.array([trajectory.mode for trajectory in successes], dtype=int)
     unowned = np.flatnonzero(labels == NO_MODE)
+    dormant = [mode for mode in dormant if len(modes[mode].representative)]
     if dormant and len(unowned):
         members = [[buffer.resample(modes[mode].representative)] for mode in dormant]
         nearest = assign_to_nearest([buffer.path(successes[i]) for i in unowned], members, rng, n_samples=1)
@@ -101,10 +171,10 @@ def _old_labels(
     return labels
 
 
-def _with_dormant(inheritance: Inheritance, dormant: list[int]) -> Inheritance:
-    """A mode without data stays as it is until it has some: it can still be commanded."""
+def _with_dormant(inheritance: Inheritance, dormant: list[int], max_modes: int) -> Inheritance:
+    """A mode without data stays as it is until it has some, where there is room: it can still be commanded."""
     heirs = {parent for parent, kept in zip(inheritance.parents, inheritance.kept, strict=True) if kept}
-    waiting = [mode for mode in dormant if mode not in heirs]
+    waiting = [mode for mode in dormant if mode not in heirs][: max(0, max_modes - len(inheritance.parents))]
     return Inheritance(
         parents=[*inheritance.parents, *waiting],
         kept=[*inheritance.kept, *(True for _ in waiting)],

@@ -25,6 +25,8 @@ def check_arguments(model: Any) -> None:
     :raises ValueError: For the first argument that cannot work
     """
     _check_ranges(model)
+    if model.mode_patience < 0:
+        raise ValueError(f"mode_patience must not be negative, got {model.mode_patience!r}")
     if model.n_steps != 1:
         raise ValueError(f"n_steps={model.n_steps} is not supported: use mode_n_steps and exploration_n_steps instead")
     if model.optimize_memory_usage:

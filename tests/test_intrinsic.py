@@ -1,0 +1,298 @@
+"""Intrinsic rewards, measures of novelty and exploration noise against hand counts, dicts, numpy and statistics."""
+
+from collections import Counter, defaultdict
+
+import numpy as np
+import pytest
+import torch as th
+from environments import TwoEnds, assert_same_state, small_model, state_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.intrinsic import RandomNetworkDistillation, RunningMoments, VisitCounts, noveld_reward
+from sb3_ddiffpg.noise import SpreadNormalActionNoise
+
+
+def test_noveld_by_hand():
+    novelty, following = th.tensor([0.0, 1.0, 1.0, 2.0]), th.tensor([3.0, 1.0, 0.4, 1.0])
+    # max(nov(s') - .5 nov(s), 0)
+    th.testing.assert_close(noveld_reward(novelty, following, 0.5), th.tensor([3.0, 0.5, 0.0, 0.0]))
+    th.testing.assert_close(noveld_reward(novelty, following, 0.0), following)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    sizes=st.lists(st.integers(1, 40), min_size=1, max_size=6),
+    mean=st.floats(-100, 100),
+    deviation=st.floats(0.01, 10),
+    seed=st.integers(0, 999),
+)
+def test_running_moments_are_those_of_all_values(sizes, mean, deviation, seed):
+    rng = np.random.default_rng(seed)
+    batches = [rng.normal(mean, deviation, (size, 3)).astype(np.float32) for size in sizes]
+    moments = RunningMoments(3)
+    for batch in batches:
+        moments.update(th.as_tensor(batch))
+    values = np.concatenate(batches).astype(np.float64)
+    scale = np.abs(values).max() + 1
+    np.testing.assert_allclose(moments.mean, values.mean(axis=0), atol=1e-5 * scale)
+    np.testing.assert_allclose(moments.var, values.var(axis=0), atol=1e-5 * scale**2)
+    assert moments.count.item() == len(values)
+    if len(values) > 20:
+        standardised = moments.standardize(th.as_tensor(values).float()).numpy()
+        np.testing.assert_allclose(standardised, (values - values.mean(axis=0)) / values.std(axis=0), atol=0.02 * scale)
+
+
+def test_running_moments_with_a_limited_memory_forget():
+    th.manual_seed(0)
+    moments = RunningMoments(1, max_count=100)
+    for _ in range(50):
+        moments.update(th.randn(10, 1))
+    for _ in range(100):
+        moments.update(5 + 2 * th.randn(10, 1))
+    assert moments.count.item() == 100
+    assert moments.mean.item() == pytest.approx(5, abs=0.8) and moments.var.item() == pytest.approx(4, abs=1.5)
+
+
+# ---------------------------------------------------------------------- visit counts
+
+
+@pytest.mark.parametrize("cell_size", [0.1, 0.5, 3.0])
+@pytest.mark.parametrize("dim", [1, 2, 4])
+def test_visit_counts_are_those_of_a_dict(cell_size, dim):
+    rng = np.random.default_rng(0)
+    counts, expected = VisitCounts(dim, 7, cell_size=cell_size, table_size=2**22), Counter()
+    # As the measure divides, in single precision: the border between two cells is where that says
+    size = np.float32(cell_size)
+
+    def cells(positions):
+        return [tuple(cell) for cell in np.floor(positions / size).astype(int).tolist()]
+
+    for _ in range(5):
+        positions = rng.normal(scale=2.0, size=(30, dim)).astype(np.float32)
+        counts.observe(th.as_tensor(positions))
+        expected.update(cells(positions))
+    queries = rng.normal(scale=2.0, size=(200, dim)).astype(np.float32)
+    novelty = counts.novelty(th.as_tensor(queries), th.zeros(200, 7)).numpy()
+    np.testing.assert_allclose(novelty, [(1 + expected[cell]) ** -0.5 for cell in cells(queries)], rtol=1e-6)
+
+
+def test_visit_counts_tell_the_cells_of_a_maze_apart():
+    """A table of fixed size must not confuse the places of a large map, negative coordinates included."""
+    counts = VisitCounts(2, 0)
+    grid = th.stack(th.meshgrid(th.arange(-50.0, 50.0), th.arange(-50.0, 50.0), indexing="ij"), dim=-1).reshape(-1, 2)
+    counts.observe(grid * 0.5 + 0.25)
+    # As many share an entry as chance would have it: n (1 - exp(-n / size)), about
+    n_shared = counts.counts[counts.counts > 1].sum().item()
+    assert n_shared < 1.2 * len(grid) * (1 - np.exp(-len(grid) / len(counts.counts)))
+    # The same cell has the same entry in every process
+    assert VisitCounts(3, 0).multipliers.tolist() == VisitCounts(3, 0).multipliers.tolist()
+    assert VisitCounts(2, 0)._entries(th.tensor([[0.6, -3.2]])).tolist() == counts._entries(th.tensor([[0.9, -3.4]])).tolist()
+
+
+def test_visit_counts_have_nothing_to_learn():
+    counts = VisitCounts(2, 3)
+    assert counts.optimizer is None and counts.update(th.zeros(4, 2), th.zeros(4, 3)).item() == 0
+    with pytest.raises(ValueError, match=r"novelty_kwargs\['cell_size'\] must be positive, got 0"):
+        VisitCounts(2, 3, cell_size=0)
+
+
+# ---------------------------------------------------------------------- random network distillation
+
+
+@pytest.mark.parametrize("with_observation", [False, True])
+def test_distillation_error_falls_where_it_was_trained_only(with_observation):
+    th.manual_seed(0)
+    measure = RandomNetworkDistillation(2, 3, with_observation=with_observation)
+    frozen = {name: value.clone() for name, value in measure.target.state_dict().items()}
+    everywhere = th.rand(2000, 2) * 20 - 10
+    measure.observe(everywhere)
+    seen = everywhere[everywhere[:, 0] < 0][:256]
+    unseen = everywhere[everywhere[:, 0] > 3][:256]
+    observations = th.randn(256, 3)
+    before = [measure.novelty(positions, observations) for positions in (seen, unseen)]
+    losses = [measure.update(seen, observations).item() for _ in range(300)]
+    after = [measure.novelty(positions, observations) for positions in (seen, unseen)]
+    assert losses[-1] < 0.05 * losses[0]
+    assert after[0].mean() < 0.25 * before[0].mean() and after[1].mean() > 3 * after[0].mean()
+    for name, value in measure.target.state_dict().items():
+        assert th.equal(value, frozen[name])
+    assert not any(parameter.requires_grad for parameter in measure.target.parameters())
+
+
+def test_distillation_error_is_the_distance_of_the_networks():
+    th.manual_seed(0)
+    measure = RandomNetworkDistillation(1, 0, net_arch=(8, 4), n_frequencies=2)
+    positions = th.tensor([[1.0], [3.0]])
+    measure.observe(positions)  # mean 2, deviation 1: -1 and 1
+    inputs = th.tensor([[x, *np.sin([x, 2 * x]), *np.cos([x, 2 * x])] for x in (-1.0, 1.0)], dtype=th.float32)
+    expected = (measure.predictor(inputs) - measure.target(inputs)).pow(2).sum(dim=1).sqrt()
+    th.testing.assert_close(measure.novelty(positions, th.zeros(2, 0)), expected.detach(), atol=1e-5, rtol=1e-4)
+
+
+# ---------------------------------------------------------------------- in the algorithm
+
+
+def filled_model(**changes):
+    """Two environments, some modes, and more in the buffer than there are visits to any place."""
+    model = small_model(DummyVecEnv([TwoEnds] * 4), **changes)
+    model.learn(160)
+    assert len(model.modes) >= 1
+    return model
+
+
+def slow_intrinsic_reward(model, window, scale=1.0):
+    """Discounted NovelD rewards of a window, row by row."""
+    total = 0.0
+    for k, row in enumerate(window[window >= 0]):
+        now, then = (
+            model.novelty_model.novelty(*model._novelty_inputs(obs[row : row + 1])).item()
+            for obs in (model.replay_buffer.observations, model.replay_buffer.next_observations)
+        )
+        total += model.gamma**k * min(max(then - model.novelty_scale * now, 0.0) / scale, 10.0)
+    return model.intrinsic_coef * total
+
+
+@pytest.mark.parametrize("mode_intrinsic_coef", [0.0, 0.5])
+@pytest.mark.parametrize("novelty", ["rnd", "counts"])
+def test_rewards_of_a_batch(novelty, mode_intrinsic_coef):
+    model = filled_model(
+        novelty=novelty,
+        mode_intrinsic_coef=mode_intrinsic_coef,
+        normalize_intrinsic=False,
+        exploration_n_steps=3,
+        reward_scale=2.0,
+    )
+    batch = model.replay_buffer.sample_modes(24, model.gamma, 3, 5)
+    expected = 2.0 * batch.rewards.numpy()
+    for group, column in np.ndindex(expected.shape):
+        intrinsic = slow_intrinsic_reward(model, batch.windows[group, column])
+        if group == 0:
+            expected[group, column] = intrinsic  # the environment's reward plays no part in exploration
+        else:
+            expected[group, column] += mode_intrinsic_coef * intrinsic
+    np.testing.assert_allclose(model._rewards(batch, defaultdict(list)).cpu(), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_intrinsic_rewards_are_scaled_by_their_own_deviation():
+    """Transitions beyond the end of a window are none, and must not enter the statistics."""
+    model = filled_model(mode_intrinsic_coef=1.0, exploration_n_steps=2)
+    model.intrinsic_moments.load_state_dict(RunningMoments(1).state_dict())
+    batch = model.replay_buffer.sample_modes(30, model.gamma, 2, 5)
+    present = batch.windows[batch.windows >= 0]
+    now, then = (
+        model.novelty_model.novelty(*model._novelty_inputs(obs)).numpy()
+        for obs in model.replay_buffer.read_observations(present)
+    )
+    rewards = np.maximum(then - 0.5 * now, 0.0)
+    metrics = defaultdict(list)
+    given = model._intrinsic_rewards(batch.windows, metrics)
+    assert model.intrinsic_moments.count.item() == len(present)
+    assert model.intrinsic_moments.var.item() == pytest.approx(rewards.var(), rel=1e-3)
+    assert metrics["intrinsic_reward"][0].item() == pytest.approx(rewards.mean(), rel=1e-4)
+    scale = rewards.std() + 1e-8
+    for group, column in np.ndindex(batch.windows.shape[:2]):
+        expected = slow_intrinsic_reward(model, batch.windows[group, column], scale)
+        assert given[group, column].item() == pytest.approx(expected, rel=1e-3)
+
+
+def test_visits_are_counted_once_each():
+    model = small_model(DummyVecEnv([TwoEnds] * 4), learning_starts=10)
+    model.learn(160)
+    assert model.novelty_model.counts.sum() == 160
+    expected = Counter(np.floor(model.replay_buffer.next_observations[:160, 0] / np.float32(0.5)).astype(int).tolist())
+    for cell, count in expected.items():
+        novelty = model.novelty_model.novelty(th.tensor([[0.5 * cell + 0.25]]), None)
+        assert novelty.item() == pytest.approx((1 + count) ** -0.5)
+
+
+class DistanceFromOrigin(th.nn.Module):
+    """A measure of a user's own: far places are new, and it learns how far far is."""
+
+    with_observation = True
+
+    def __init__(self, position_dim, observation_dim, unit=1.0):
+        super().__init__()
+        assert position_dim == 1 and observation_dim == 2
+        self.unit = unit
+        self.far = th.nn.Parameter(th.ones(1))
+        self.optimizer = th.optim.SGD([self.far], lr=0.1)
+        self.register_buffer("n_seen", th.zeros(1))
+
+    def observe(self, positions):
+        assert positions.shape[1:] == (1,)
+        self.n_seen += len(positions)
+
+    @th.no_grad()
+    def novelty(self, positions, observations):
+        assert observations.shape == (len(positions), 2) and observations.abs().max() <= 1.0 + 1e-6  # the scaled features
+        return positions.abs().sum(dim=1) / self.unit / self.far
+
+    def update(self, positions, observations):
+        loss = (self.far - positions.abs().mean()).pow(2).sum()
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        return loss.detach()
+
+
+def test_a_measure_of_ones_own(tmp_path):
+    model = small_model(DummyVecEnv([TwoEnds] * 4), novelty=DistanceFromOrigin, novelty_kwargs={"unit": 2.0})
+    model.learn(160)
+    assert isinstance(model.novelty_model, DistanceFromOrigin) and model.novelty_model.unit == 2.0
+    assert model.novelty_model.n_seen.item() == 160 and model.novelty_model.far.item() != 1.0
+    model.save(tmp_path / "model")
+    assert_same_state(state_of(DDiffPG.load(tmp_path / "model")), state_of(model))
+
+
+# ---------------------------------------------------------------------- exploration noise
+
+
+def test_spread_noise_is_gaussian_with_the_deviation_of_its_episode():
+    np.random.seed(0)
+    noise = SpreadNormalActionNoise(3, 4, low=0.2, high=0.4)
+    noise.reset()
+    sigma = noise.sigma.copy()
+    assert ((0.2 <= sigma) & (sigma <= 0.4)).all() and len(set(sigma)) == 3
+    draws = np.stack([noise() for _ in range(5000)])
+    assert draws.shape == (5000, 3, 4) and draws.dtype == np.float32
+    np.testing.assert_allclose(draws.mean(axis=0), 0.0, atol=0.03)
+    np.testing.assert_allclose(draws.std(axis=(0, 2)), sigma, rtol=0.03)
+    correlation = np.corrcoef(draws.reshape(5000, 12).T) - np.eye(12)
+    assert np.abs(correlation).max() < 0.06
+    # Only the environment whose episode ended draws anew
+    noise.reset(indices=[1])
+    assert noise.sigma[1] != sigma[1] and (noise.sigma[[0, 2]] == sigma[[0, 2]]).all()
+
+
+def test_spread_noise_sees_all_deviations_in_time():
+    np.random.seed(0)
+    noise = SpreadNormalActionNoise(1, 1)
+    drawn = []
+    for _ in range(2000):
+        noise.reset()
+        drawn.append(noise.sigma[0])
+    np.testing.assert_allclose(np.quantile(drawn, [0.0, 0.25, 0.5, 0.75, 1.0]), np.linspace(0.05, 0.6, 5), atol=0.02)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.1, 0.5), (0.5, 0.1)])
+def test_spread_noise_takes_an_interval(low, high):
+    with pytest.raises(ValueError, match="low and high must satisfy"):
+        SpreadNormalActionNoise(1, 1, low, high)
+
+
+def test_each_episode_draws_its_noise():
+    model = small_model(DummyVecEnv([lambda: TwoEnds(limit=4)] * 2), learning_starts=0)
+    deviations = []
+
+    def watch(local_variables, _):
+        deviations.append(model.action_noise.sigma.copy())
+        return True
+
+    model.learn(120, callback=watch)
+    deviations = np.array(deviations)
+    changes = (np.diff(deviations, axis=0) != 0).sum(axis=0)
+    episodes = model._episode_num
+    assert (changes >= episodes / 4).all() and changes.sum() <= episodes
