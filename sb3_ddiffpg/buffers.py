@@ -1,20 +1,17 @@
-"""Replay buffer that knows trajectories and modes, and stores a target action beside every action."""
+"""Replay buffer that knows modes, and stores target actions beside every action."""
 
-from collections import deque
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from scipy.spatial.distance import cdist
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.preprocessing import get_obs_shape
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.dtw import erase_loops, resample_path
-from sb3_ddiffpg.features import ModeFeatures, Observation
-from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, SuccessRule, Trajectory
+from sb3_ddiffpg.features import ModeFeatures
+from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, Trajectory
+from sb3_ddiffpg.trajectory_buffer import TrajectoryReplayBuffer
 
 EXPLORATORY = 0  # the first group of a batch
 
@@ -40,13 +37,10 @@ class ModeBatch(NamedTuple):
     windows: np.ndarray
 
 
-class ModeReplayBuffer(ReplayBuffer):
+class ModeReplayBuffer(TrajectoryReplayBuffer):
     """
-    Transitions live in rows; a finished trajectory owns its rows. When rows run out, the oldest trajectory that no mode
-    needs is evicted, then the oldest of whichever group (mode and outcome) holds most rows, so that a rare mode is never
-    crowded out. Each row has two target actions: one for the mode that owns its trajectory, one for the exploratory group.
-
-    Storage is allocated at the first ``add``: a model that is loaded to act needs none.
+    A ``TrajectoryReplayBuffer`` whose trajectories belong to modes. Each row has two target actions: one for the mode that
+    owns its trajectory, one for the exploratory group.
 
     :param buffer_size: Capacity in transitions (over all environments)
     :param observation_space: Observation space
@@ -55,20 +49,21 @@ class ModeReplayBuffer(ReplayBuffer):
     :param n_envs: Number of parallel environments
     :param optimize_memory_usage: Not supported
     :param handle_timeout_termination: Whether time limits are bootstrapped through
+    :param success_key: See ``TrajectoryReplayBuffer``
     :param mode_features: See ``ModeFeatures``
-    :param success_key: Key of ``info`` that marks a success; None reads ``is_success`` or ``success`` and, where neither
-        exists, counts the trajectories whose return is in the top fifth of those seen lately
     :param max_successes_per_mode: Newest goal-reached trajectories that train a mode; older ones serve exploration only
     :param max_failures_per_mode: Newest failed trajectories that train a mode
+    :param max_length_ratio: A success longer than this times the mode's shortest is a detour: it is remembered for the next
+        clustering, but trains no mode
+    :param min_direct: The mode's shortest successes, so many, are never detours
     :param n_path_points: Points to which a trajectory's path is resampled for clustering
+    :param loop_share: Radius within which a path that comes back has made a loop, as a share of the path's extent
+    :param route_share: Distance beyond which a step is off a mode's route, as a share of the route's extent
     :raises ValueError: If a size is not positive or ``optimize_memory_usage`` is asked for
     """
 
-    observations: Any
-    next_observations: Any
     target_actions: np.ndarray
     exploratory_target_actions: np.ndarray
-    next_row: np.ndarray
 
     def __init__(
         self,
@@ -79,8 +74,8 @@ class ModeReplayBuffer(ReplayBuffer):
         n_envs: int = 1,
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
-        mode_features: Any = None,
         success_key: str | None = None,
+        mode_features: Any = None,
         max_successes_per_mode: int = 40,
         max_failures_per_mode: int = 20,
         max_length_ratio: float = 1.5,
@@ -89,23 +84,18 @@ class ModeReplayBuffer(ReplayBuffer):
         loop_share: float = 0.05,
         route_share: float = 0.1,
     ) -> None:
-        if optimize_memory_usage:
-            raise ValueError("optimize_memory_usage=True is not supported: trajectories do not lie in one ring")
-        for name, value in (
-            ("buffer_size", buffer_size),
-            ("max_successes_per_mode", max_successes_per_mode),
-            ("max_failures_per_mode", max_failures_per_mode),
+        for name, value, least in (
+            ("max_successes_per_mode", max_successes_per_mode, 1),
+            ("max_failures_per_mode", max_failures_per_mode, 1),
+            ("max_length_ratio", max_length_ratio, 1),
+            ("min_direct", min_direct, 1),
+            ("n_path_points", n_path_points, 2),
+            ("loop_share", loop_share, 0),
+            ("route_share", route_share, 0),
         ):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
-        if n_path_points < 2:
-            raise ValueError(f"n_path_points must be at least 2, got {n_path_points}")
-        # Not ReplayBuffer's constructor: it would allocate a ring per environment
-        super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
-        self.optimize_memory_usage = False
-        self.handle_timeout_termination = handle_timeout_termination
+            if value < least:
+                raise ValueError(f"{name} must be at least {least}, got {value}")
         self.features = ModeFeatures(observation_space, mode_features)
-        self.success_key = success_key
         self.max_successes_per_mode = max_successes_per_mode
         self.max_failures_per_mode = max_failures_per_mode
         self.max_length_ratio = max_length_ratio
@@ -113,247 +103,58 @@ class ModeReplayBuffer(ReplayBuffer):
         self.n_path_points = n_path_points
         self.loop_share = loop_share
         self.route_share = route_share
-        self.reset()
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            device,
+            n_envs=n_envs,
+            optimize_memory_usage=optimize_memory_usage,
+            handle_timeout_termination=handle_timeout_termination,
+            success_key=success_key,
+        )
 
     # ------------------------------------------------------------------ storage
 
     def reset(self) -> None:
         """Forget everything and release the storage."""
         super().reset()
-        self._allocated = False
-        self._free = np.empty(0, dtype=np.int32)  # stack of rows that were used and freed
-        self._n_free = 0
-        self._running = np.empty((self.n_envs, 64), dtype=np.int32)
-        self._running_length = np.zeros(self.n_envs, dtype=np.int64)
-        self._running_return = np.zeros(self.n_envs)
-        self._groups: dict[tuple[int, bool], deque[Trajectory]] = {}
-        self._group_rows: dict[tuple[int, bool], int] = {}
-        self._retired: deque[Trajectory] = deque()
-        self._n_finished = 0
-        self._last_rows = np.empty(0, dtype=np.int32)
-        self._success_rule = SuccessRule(self.success_key)
         self._feature_scale: np.ndarray | None = None
         self._distances = DistanceCache()
         self._mode_position = np.empty(0, dtype=np.int32)
-        self.just_finished: list[tuple[int, Trajectory]] = []
         self.mode_rows: list[RowSet] = []
 
     def _row_arrays(self) -> list[str]:
-        return [
-            *("observations", "next_observations", "actions", "target_actions", "exploratory_target_actions"),
-            *("rewards", "off_route", "dones", "timeouts", "next_row", "_all_position", "_mode_position"),
-        ]
+        own = ["target_actions", "exploratory_target_actions", "off_route", "_mode_position"]
+        return [*super()._row_arrays(), *own]
 
     def _allocate(self) -> None:
-        """The operating system commits zeroed pages only when they are written, so an unfilled buffer stays small."""
-
-        def zeros_like_space(space: spaces.Space) -> np.ndarray:
-            shape = get_obs_shape(space)
-            return np.zeros((self.buffer_size, *shape), dtype=self._maybe_cast_dtype(space.dtype))
-
-        if isinstance(self.observation_space, spaces.Dict):
-            self.observations = {key: zeros_like_space(space) for key, space in self.observation_space.items()}
-            self.next_observations = {key: zeros_like_space(space) for key, space in self.observation_space.items()}
-        else:
-            self.observations = zeros_like_space(self.observation_space)
-            self.next_observations = zeros_like_space(self.observation_space)
-        for name in ("actions", "target_actions", "exploratory_target_actions"):
-            setattr(self, name, np.zeros((self.buffer_size, self.action_dim), dtype=np.float32))
-        self.rewards = np.zeros(self.buffer_size, dtype=np.float32)
+        super()._allocate()
+        self.target_actions = np.zeros_like(self.actions)
+        self.exploratory_target_actions = np.zeros_like(self.actions)
         self.off_route = np.zeros(self.buffer_size, dtype=bool)
-        self.dones = np.zeros(self.buffer_size, dtype=bool)
-        self.timeouts = np.zeros(self.buffer_size, dtype=bool)
-        self.next_row = np.zeros(self.buffer_size, dtype=np.int32)
-        self._all_position = np.zeros(self.buffer_size, dtype=np.int32)
         self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
-        self._all = RowSet(self._all_position)
         for row_set in self.mode_rows:
             row_set.position = self._mode_position
-        self._allocated = True
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Only used rows are pickled."""
-        state = self.__dict__.copy()
-        if self._allocated:
-            for name in self._row_arrays():
-                array = state[name]
-                used = {k: v[: self.pos] for k, v in array.items()} if isinstance(array, dict) else array[: self.pos]
-                state[name] = used
-        return state
+    def _write_rows(self, rows: np.ndarray, obs: Any, next_obs: Any, action: np.ndarray, *args: Any) -> None:
+        super()._write_rows(rows, obs, next_obs, action, *args)
+        self.target_actions[rows] = self.exploratory_target_actions[rows] = action
+        self.off_route[rows] = False
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        if not self._allocated:
-            return
-        saved = {name: state[name] for name in self._row_arrays()}
-        all_rows = self._all
-        self._allocate()
-        for name, array in saved.items():
-            target = getattr(self, name)
-            for full, used in zip(
-                target.values() if isinstance(target, dict) else [target],
-                array.values() if isinstance(array, dict) else [array],
-                strict=True,
-            ):
-                full[: self.pos] = used
-        self._all = all_rows
-        self._all.position = self._all_position
-
-    def size(self) -> int:
-        """
-        :return: Number of stored transitions
-        """
-        return self._all.size if self._allocated else 0
-
-    def _take_rows(self, n: int) -> np.ndarray:
-        """Rows for n transitions: unused ones first, then freed ones, then those of an evicted trajectory."""
-        unused = min(n, self.buffer_size - self.pos)
-        rows = np.arange(self.pos, self.pos + unused, dtype=np.int32)
-        self.pos += unused
-        if unused < n:
-            self.full = True
-            while self._n_free < n - unused:
-                self._evict()
-            self._n_free -= n - unused
-            rows = np.concatenate((rows, self._free[self._n_free : self._n_free + n - unused]))
-        return rows
-
-    def _evict(self) -> None:
-        if self._retired:
-            trajectory = self._retired.popleft()
-        else:
-            # The last success of a mode stays: without it the mode would have nothing to learn from
-            spare = [key for key, group in self._groups.items() if len(group) > (key[0] != NO_MODE and key[1])]
-            if not spare:
-                raise ValueError(
-                    f"buffer_size={self.buffer_size} transitions is too small: the unfinished episodes of {self.n_envs} "
-                    "environment(s) fill it. Give at least n_envs times the episode length"
-                )
-            largest = max(spare, key=lambda key: self._group_rows[key])
-            trajectory = self._groups[largest].popleft()
-            self._group_rows[largest] -= trajectory.length
-        self._free_rows(trajectory.rows)
+    def _evict(self) -> Trajectory:
+        trajectory = super()._evict()
         if trajectory.trains:
             self.mode_rows[trajectory.mode].remove(trajectory.rows)
-
-    def _free_rows(self, rows: np.ndarray) -> None:
-        self._all.remove(rows)
-        needed = self._n_free + len(rows)
-        if needed > len(self._free):
-            self._free = np.concatenate((self._free[: self._n_free], np.empty(2 * needed, dtype=np.int32)))
-        self._free[self._n_free : needed] = rows
-        self._n_free = needed
-
-    # ------------------------------------------------------------------ adding
-
-    def add(
-        self,
-        obs: Observation,
-        next_obs: Observation,
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """
-        Store one transition of every environment. Trajectories that end are listed in ``just_finished``.
-
-        :param obs: Observations, [n_envs, ...] (or a dict of such)
-        :param next_obs: Next observations, the terminal one where an episode ended
-        :param action: Actions in [-1, 1], [n_envs, action_dim]
-        :param reward: [n_envs]
-        :param done: [n_envs]
-        :param infos: One dict per environment
-        :raises ValueError: If a value is not finite (nothing is stored then), or the buffer cannot hold one episode
-        """
-        if not self._allocated:
-            self._allocate()
-        action = np.asarray(action, dtype=np.float32).reshape(self.n_envs, self.action_dim)
-        for name, value in (("observation", obs), ("next observation", next_obs), ("action", action), ("reward", reward)):
-            self._check_finite(name, value)
-        rows = self._take_rows(self.n_envs)
-        self._write(self.observations, rows, obs)
-        self._write(self.next_observations, rows, next_obs)
-        self.actions[rows] = self.target_actions[rows] = self.exploratory_target_actions[rows] = action
-        self.rewards[rows] = reward
-        self.off_route[rows] = False
-        self.dones[rows] = done
-        self.timeouts[rows] = False
-        self.next_row[rows] = -1
-        self._all.add(rows)
-
-        running = np.flatnonzero(self._running_length > 0)
-        self.next_row[self._running[running, self._running_length[running] - 1]] = rows[running]
-        longest = int(self._running_length.max(initial=0))
-        if longest == self._running.shape[1]:
-            self._running = np.concatenate((self._running, np.empty_like(self._running)), axis=1)
-        self._running[np.arange(self.n_envs), self._running_length] = rows
-        self._running_length += 1
-        self._running_return += reward
-
-        self._last_rows = rows
-        self.just_finished = []
-        for env in np.flatnonzero(done):
-            if self.handle_timeout_termination:
-                self.timeouts[rows[env]] = bool(infos[env].get("TimeLimit.truncated", False))
-            self.just_finished.append((int(env), self._finish(int(env), infos[env])))
-
-    @staticmethod
-    def _write(array: Any, rows: np.ndarray, value: Any) -> None:
-        if isinstance(array, dict):
-            for key in array:
-                array[key][rows] = np.asarray(value[key]).reshape(len(rows), *array[key].shape[1:])
-        else:
-            array[rows] = np.asarray(value).reshape(len(rows), *array.shape[1:])
-
-    @staticmethod
-    def _check_finite(name: str, value: Any) -> None:
-        for array in value.values() if isinstance(value, dict) else [value]:
-            array = np.asarray(array)
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
-                env = int(np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))[0])
-                raise ValueError(
-                    f"The {name} of environment {env} is not finite: {array[env]}. Nothing of this step was stored"
-                )
-
-    def _finish(self, env: int, info: dict[str, Any]) -> Trajectory:
-        length = self._running_length[env]
-        trajectory = Trajectory(
-            rows=self._running[env, :length].copy(),
-            success=self._success_rule(info, float(self._running_return[env])),
-            episode_return=float(self._running_return[env]),
-            serial=self._n_finished,
-        )
-        self._n_finished += 1
-        self._running_length[env] = 0
-        self._running_return[env] = 0.0
-        self._insert(trajectory)
         return trajectory
 
-    def _insert(self, trajectory: Trajectory) -> None:
-        key = (trajectory.mode, trajectory.success and not trajectory.foreign)
-        self._groups.setdefault(key, deque()).append(trajectory)
-        self._group_rows[key] = self._group_rows.get(key, 0) + trajectory.length
+    # ------------------------------------------------------------------ modes
 
     def last_positions(self) -> np.ndarray:
         """
         :return: Mode features of the states reached by the latest ``add``, shape [n_envs, dim]
         """
         return self.features(self._read(self.next_observations, self._last_rows))
-
-    def drop_unfinished_episodes(self) -> None:
-        """Forget the transitions of running episodes: call it when the environments were reset outside."""
-        for env in np.flatnonzero(self._running_length > 0):
-            self._free_rows(self._running[env, : self._running_length[env]].copy())
-        self._running_length[:] = 0
-        self._running_return[:] = 0.0
-
-    # ------------------------------------------------------------------ modes
-
-    @property
-    def has_success_signal(self) -> bool:
-        """Whether the environment itself says what a success is."""
-        return self._success_rule.has_signal
 
     def expect_modes(self, n_modes: int) -> None:
         """
@@ -364,14 +165,6 @@ class ModeReplayBuffer(ReplayBuffer):
         successes, failures = self.trajectories(success=True), self.trajectories(success=False)
         nobody = np.full(len(successes), NO_MODE), np.full(len(failures), NO_MODE)
         self.assign_modes(successes, nobody[0], failures, nobody[1], [None] * n_modes)
-
-    def trajectories(self, success: bool) -> list[Trajectory]:
-        """
-        :param success: Goal-reached or failed ones (and those foreign to their mode)
-        :return: Those in use by a mode or not yet clustered, in order of finishing
-        """
-        found = [t for key, group in self._groups.items() if key[1] == success for t in group]
-        return sorted(found, key=lambda trajectory: trajectory.serial)
 
     def path(self, trajectory: Trajectory) -> np.ndarray:
         """
@@ -503,41 +296,6 @@ class ModeReplayBuffer(ReplayBuffer):
 
     # ------------------------------------------------------------------ sampling
 
-    def _read(self, array: Any, rows: np.ndarray) -> Any:
-        return {key: value[rows] for key, value in array.items()} if isinstance(array, dict) else array[rows]
-
-    def read_observations(self, rows: np.ndarray, env: VecNormalize | None = None) -> tuple[Any, Any]:
-        """
-        :param rows: Shape [N]
-        :param env: Normalises the observations when given
-        :return: Observations and next observations of the rows, unprocessed NumPy arrays or dicts of such
-        """
-        obs, next_obs = self._read(self.observations, rows), self._read(self.next_observations, rows)
-        return self._normalize_obs(obs, env), self._normalize_obs(next_obs, env)
-
-    def _tensors(self, obs: Any) -> Any:
-        return {key: self.to_torch(value) for key, value in obs.items()} if isinstance(obs, dict) else self.to_torch(obs)
-
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """
-        Draw transitions uniformly, whatever their mode.
-
-        :param batch_size: Number of transitions
-        :param env: Normalises observations and rewards when given
-        :return: SB3's samples
-        """
-        rows = self._all.sample(batch_size)
-        obs, next_obs = self.read_observations(rows, env)
-        dones = (self.dones[rows] & ~self.timeouts[rows]).astype(np.float32)
-        samples = DictReplayBufferSamples if isinstance(self.observation_space, spaces.Dict) else ReplayBufferSamples
-        return samples(  # type: ignore[return-value]
-            observations=self._tensors(obs),
-            actions=self.to_torch(self.actions[rows]),
-            next_observations=self._tensors(next_obs),
-            dones=self.to_torch(dones[:, None]),
-            rewards=self.to_torch(self._normalize_reward(self.rewards[rows, None], env)),
-        )
-
     def sample_modes(
         self, batch_size: int, gamma: float, exploration_n_steps: int, mode_n_steps: int, env: VecNormalize | None = None
     ) -> ModeBatch:
@@ -553,6 +311,8 @@ class ModeReplayBuffer(ReplayBuffer):
         """
         n_groups = len(self.mode_rows) + 1
         n = batch_size // n_groups
+        if n == 0:
+            raise ValueError(f"batch_size={batch_size} is smaller than the number of groups, {n_groups}")
         active = np.array([True, *(row_set.size > 0 for row_set in self.mode_rows)])
         sets = [self._all, *(row_set if row_set.size else self._all for row_set in self.mode_rows)]
         rows = np.stack([row_set.sample(n) for row_set in sets])  # [G, n]

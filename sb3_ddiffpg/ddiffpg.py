@@ -336,7 +336,7 @@ class DDiffPG(OffPolicyAlgorithm):
     @property
     def modes(self) -> ModeTable:
         """The modes discovered so far: iterate, index by name or number, or print."""
-        embeddings = self.policy.mode_embeddings[1:].cpu().numpy()
+        embeddings = self.policy.mode_embeddings[1:].cpu().numpy().copy()
         for mode, embedding in zip(self._modes, embeddings, strict=True):
             mode.embedding = embedding
         return ModeTable(self._modes)
@@ -563,7 +563,7 @@ class DDiffPG(OffPolicyAlgorithm):
         indices: int | np.ndarray | None = None
         if mode is not None:
             table = ModeTable(self._modes)
-            single = isinstance(mode, (str, int, np.integer))
+            single = np.ndim(mode) == 0
             indices = table.index(mode) if single else np.array([table.index(each) for each in mode])  # type: ignore[arg-type, union-attr]
         return self.policy.predict(observation, state, episode_start, deterministic, mode=indices)
 
@@ -571,6 +571,8 @@ class DDiffPG(OffPolicyAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         assert self._last_obs is not None, "self._last_obs was not set"
+        # Before the environments are given an action that follows from NaN
+        self.replay_buffer.check_finite("observation", self._last_obs)
         shape = (n_envs, *self.action_space.shape)  # type: ignore[misc]
         if self.num_timesteps < learning_starts:
             scaled_action = np.random.uniform(-1.0, 1.0, size=shape).astype(np.float32)
@@ -584,7 +586,9 @@ class DDiffPG(OffPolicyAlgorithm):
 
     def _draw_group(self) -> int:
         """What drives an environment through its next episode: exploration, or the modes and the zero embedding in turn."""
-        if not self._modes or np.random.rand() < self._exploration_share():
+        # The random actions of the warm-up are no mode's doing
+        warming_up = self.num_timesteps < self.learning_starts
+        if not self._modes or warming_up or np.random.rand() < self._exploration_share():
             return EXPLORATORY_GROUP
         return self._next_in_turn()
 
@@ -666,11 +670,18 @@ class DDiffPG(OffPolicyAlgorithm):
     ) -> tuple[int, BaseCallback]:
         assert self.env is not None, "You must set the environment before calling learn()"
         self._check_buffer(self.env)
-        if reset_num_timesteps or self._last_obs is None:
+        new_episodes = reset_num_timesteps or self._last_obs is None
+        if new_episodes:
             self.replay_buffer.drop_unfinished_episodes()
+        total_timesteps, callback = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        # What an earlier run left behind would end the exploration of this one's first episodes
+        self._update_current_progress_remaining(self.num_timesteps, max(total_timesteps, 1))
+        if new_episodes:
             self._env_groups = np.array([self._draw_group() for _ in range(self.n_envs)], dtype=np.int64)
             self._env_handed_over = np.zeros(self.n_envs, dtype=bool)
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        return total_timesteps, callback
 
     def _check_buffer(self, env: VecEnv) -> None:
         """The episodes in progress must fit, or hours later there would be nothing to evict."""
@@ -688,12 +699,16 @@ class DDiffPG(OffPolicyAlgorithm):
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         """
-        See SB3. A callback that stops the training makes SB3 drop the last transition (its issue 2056): the next ``learn``
-        then resets the environments, or the running trajectories would have a gap.
+        See SB3. A callback that stops the training makes SB3 drop the last transition (its issue 2056), and so does an error
+        or an interrupt: the next ``learn`` then resets the environments, or the running trajectories would have a gap.
         """
-        rollout = super().collect_rollouts(*args, **kwargs)
-        if not rollout.continue_training:
-            self._last_obs = None
+        complete = False
+        try:
+            rollout = super().collect_rollouts(*args, **kwargs)
+            complete = rollout.continue_training
+        finally:
+            if not complete:
+                self._last_obs = None
         return rollout
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:

@@ -9,7 +9,7 @@ import numpy as np
 from sb3_ddiffpg.clustering import Inheritance
 
 
-@dataclass
+@dataclass(eq=False)
 class Mode:
     """
     One discovered way to solve the task.
@@ -67,6 +67,12 @@ class ModeTable(Sequence[Mode]):
         :param key: Index, slice or name
         """
         return self._modes[self.index(key) if isinstance(key, str) else key]
+
+    def __contains__(self, mode: object) -> bool:
+        """
+        :param mode: A name or a record
+        """
+        return mode in self.names if isinstance(mode, str) else any(mode is each for each in self._modes)
 
     def index(self, mode: str | int, *args) -> int:
         """

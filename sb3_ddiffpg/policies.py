@@ -332,11 +332,13 @@ class DiffusionPolicy(BasePolicy):
         held = None
         if group is None and mode is not None:
             held = np.atleast_1d(np.asarray(mode))
-            if held.size and (held.min() < 0 or held.max() >= self.n_modes):
-                raise ValueError(f"mode={mode!r} is unknown; this policy has {self.n_modes} modes, numbered from 0")
+            if held.min() < 0:
+                raise ValueError(f"mode={mode!r} is unknown; modes are numbered from 0")
         elif group is None and (state is not None or episode_start is not None):
             held = self._draw_modes(state, episode_start)
         if held is not None:
+            if held.max() >= self.n_modes:
+                raise ValueError(f"mode={held.max()} (or the one in state) is unknown; this policy has {self.n_modes} modes")
             group = np.where(held < 0, UNCONDITIONED, held + 1)
         self._embeddings_in_use = None
         # A tuple is the mistake that SB3's predict explains

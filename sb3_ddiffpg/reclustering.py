@@ -139,7 +139,8 @@ def _foreign(modes: Sequence[Mode], heirs: dict[int, int], successes: list[Traje
     they were told to follow. Seen as successes they would tell its critic that any route will do, and the policy of a
     longer route would drift to the shorter one beside it; unseen they would tell it nothing. So it sees them as failures.
     """
-    told = {mode.name: heirs[old] for old, mode in enumerate(modes) if old in heirs}
+    # A mode that waits for its first trajectory has no route yet that one could leave
+    told = {mode.name: heirs[old] for old, mode in enumerate(modes) if old in heirs and heirs[old] in labels}
     foreign: dict[int, int] = {}
     for i, trajectory in enumerate(successes):
         mode = told.get(trajectory.commanded or "", NO_MODE)

@@ -13,7 +13,7 @@ def trained():
     from environments import TwoEnds, small_model
     from stable_baselines3.common.vec_env import DummyVecEnv
 
-    model = small_model(DummyVecEnv([TwoEnds] * 4), novelty="rnd")
+    model = small_model(DummyVecEnv([TwoEnds] * 4), novelty="rnd", gradient_steps=4)
     model.learn(400)
     assert len(model.modes) == 2
     return model

@@ -1,5 +1,6 @@
 """Tiny environments, models and hand-made trajectories, shared by tests."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -8,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 
-from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg import DDiffPG, ModeReplayBuffer
 
 SMALL: dict[str, Any] = {
     "learning_starts": 40,
@@ -117,6 +118,16 @@ def image_dict_space(channel_last: bool = False) -> spaces.Dict:
     )
 
 
+def fill(buffer: ModeReplayBuffer, paths: Sequence[np.ndarray], success: bool = True, reward: float = 1.0) -> None:
+    """One environment walks along each path (an array [length + 1, dim]) and ends there, with the reward at the end."""
+    for path in paths:
+        for k in range(len(path) - 1):
+            last = k == len(path) - 2
+            action = np.clip(path[k + 1] - path[k], -1, 1)[None, :2]
+            infos = [{"is_success": success and last}]
+            buffer.add(path[k][None], path[k + 1][None], action, np.array([reward * last]), np.array([last]), infos)
+
+
 def some_observations(n: int = 10) -> np.ndarray:
     """Inside the observation space of ``TwoEnds``."""
     return np.random.default_rng(0).uniform(-1, 1, (n, 2)).astype(np.float32)
@@ -145,3 +156,13 @@ def assert_same_state(first: dict[str, th.Tensor], second: dict[str, th.Tensor])
     assert first.keys() == second.keys()
     for name in first:
         assert th.equal(first[name], second[name]), name
+
+
+def assert_no_gaps(buffer: ModeReplayBuffer) -> None:
+    """Every trajectory of ``TwoEnds`` is one whole episode, the running ones included."""
+    finished = [trajectory.rows for success in (True, False) for trajectory in buffer.trajectories(success)]
+    running = [rows[:length] for rows, length in zip(buffer._running, buffer._running_length, strict=True) if length]
+    for rows in (*finished, *running):
+        np.testing.assert_array_equal(buffer.observations[rows[1:]], buffer.next_observations[rows[:-1]])
+        assert buffer.observations[rows[0], 1] == 0.0  # the time within the episode
+    assert all(buffer.dones[rows[-1]] and not buffer.dones[rows[:-1]].any() for rows in finished)

@@ -6,7 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
-from environments import AnySpaces, TwoEnds, image_dict_space, small_model
+from environments import AnySpaces, TwoEnds, fill, image_dict_space, small_model
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,16 +23,6 @@ GAMMA = 0.9
 
 def make_buffer(buffer_size=200, n_envs=1, observation_space=OBSERVATION, **kwargs):
     return ModeReplayBuffer(buffer_size, observation_space, ACTION, device="cpu", n_envs=n_envs, **kwargs)
-
-
-def fill(buffer, paths, success=True, reward=1.0):
-    """One environment walks along each path (an array [length + 1, dim]) and ends there, with the reward at the end."""
-    for path in paths:
-        for k in range(len(path) - 1):
-            last = k == len(path) - 2
-            action = np.clip(path[k + 1] - path[k], -1, 1)[None, :2]
-            infos = [{"is_success": success and last}]
-            buffer.add(path[k][None], path[k + 1][None], action, np.array([reward * last]), np.array([last]), infos)
 
 
 class PlainBuffer:
@@ -54,7 +44,7 @@ class PlainBuffer:
             return [min(retired, key=lambda episode: episode["retired"])]
         groups = defaultdict(list)
         for episode in self.episodes:
-            groups[episode["mode"], episode["success"]].append(episode)
+            groups[episode["mode"], episode["success"] and not episode["foreign"]].append(episode)
         # A mode's only success stays
         groups = [group for key, group in groups.items() if len(group) > 1 or key[0] == NO_MODE or not key[1]]
         largest = max((sum(len(e["steps"]) for e in group) for group in groups), default=0)
@@ -76,42 +66,59 @@ class PlainBuffer:
     def add(self, env, step, done, success):
         self.running[env].append(step)
         if done:
-            episode = {"steps": self.running[env], "success": success, "mode": NO_MODE, "retired": None}
-            self.episodes.append(episode | {"serial": self.n_finished})
+            episode = {"steps": self.running[env], "success": success, "serial": self.n_finished}
+            self.episodes.append(episode | {"mode": NO_MODE, "trains": False, "foreign": False, "retired": None})
             self.n_finished += 1
             self.running[env] = []
 
-    def assign(self, success_modes, failure_modes, parents):
-        self.n_modes = len(parents)
-        for success, modes in ((True, success_modes), (False, failure_modes)):
-            active = [e for e in self.episodes if e["success"] == success and e["retired"] is None]
-            active.sort(key=lambda e: e["serial"])
-            for index, (episode, mode) in enumerate(zip(active, modes, strict=True)):
-                old = episode["mode"]
-                stays_in_family = old == NO_MODE or (mode != NO_MODE and parents[mode] == old)
-                if not stays_in_family:
-                    for step in episode["steps"]:
-                        step["target"] = step["action"]
-                newer = sum(other == mode for other in modes[index + 1 :])
-                episode["new_mode"] = mode if newer < self.limits[success] else None
-        retiring = [e for e in self.episodes if e.get("new_mode", NO_MODE) is None]
-        n_retired = sum(e["retired"] is not None for e in self.episodes)
-        for order, episode in enumerate(sorted(retiring, key=lambda e: e["serial"])):
-            episode["retired"] = (self.n_finished, n_retired + order)
-        for episode in self.episodes:
-            new = episode.pop("new_mode", NO_MODE)
-            episode["mode"] = NO_MODE if new is None else new
+    def active(self, success):
+        """Those in use by a mode or not yet clustered, in order of finishing; foreign successes count as failures."""
+        found = [e for e in self.episodes if (e["success"] and not e["foreign"]) == success and e["retired"] is None]
+        return sorted(found, key=lambda episode: episode["serial"])
 
-    def window(self, number, n_steps):
-        """n-step reward, discount and the last step of the window that begins with a step."""
+    def assign(self, success_modes, failure_modes, parents):
+        retiring = []
+        n_retired = sum(episode["retired"] is not None for episode in self.episodes)
+        for success, modes in ((True, success_modes), (False, failure_modes)):
+            limit, members = self.limits[success], defaultdict(list)
+            for episode, mode in zip(self.active(success), modes, strict=True):
+                members[mode].append(episode)
+            for mode, episodes in members.items():
+                direct = self.direct(episodes) if success else episodes
+                direct = [] if mode == NO_MODE else direct
+                detours = [episode for episode in episodes if episode not in direct]
+                for episode in episodes:
+                    stays_in_family = episode["mode"] == NO_MODE or (mode != NO_MODE and parents[mode] == episode["mode"])
+                    if not stays_in_family:
+                        for step in episode["steps"]:
+                            step["target"] = step["action"]
+                    episode["mode"] = mode
+                    episode["trains"] = episode in direct[-limit:]
+                retiring += [*direct[:-limit], *detours[:-limit]]
+        self.n_modes = len(parents)
+        for order, episode in enumerate(sorted(retiring, key=lambda episode: episode["serial"])):
+            episode.update(mode=NO_MODE, retired=(self.n_finished, n_retired + order))
+
+    def direct(self, episodes):
+        """At most half as long again as the shortest, and the five shortest in any case."""
+        lengths = sorted(len(episode["steps"]) for episode in episodes)
+        limit = max(1.5 * lengths[0], lengths[:5][-1])
+        return [episode for episode in episodes if len(episode["steps"]) <= limit]
+
+    def window(self, number, n_steps, for_mode):
+        """
+        n-step reward, discount and the last step of the window that begins with a step. For a mode, a step off its route is
+        the end, without reward.
+        """
         episodes = [e["steps"] for e in self.episodes] + self.running
         steps = next(e for e in episodes if any(step["number"] == number for step in e))
         first = next(i for i, step in enumerate(steps) if step["number"] == number)
-        reward, discount = 0.0, 1.0
+        reward, discount, lost = 0.0, 1.0, False
         for last in steps[first : first + n_steps]:
-            reward += discount * last["reward"]
+            lost = lost or (for_mode and last["off_route"])
+            reward += 0.0 if lost else discount * last["reward"]
             discount *= GAMMA
-        return reward, 0.0 if last["done"] and not last["timeout"] else discount, last
+        return reward, 0.0 if lost or (last["done"] and not last["timeout"]) else discount, last
 
 
 class BufferMachine(RuleBasedStateMachine):
@@ -165,15 +172,30 @@ class BufferMachine(RuleBasedStateMachine):
                 "reward": float(rewards[env]),
                 "done": bool(dones[env]),
                 "timeout": bool(timeouts[env]),
+                "off_route": False,
             }
             self.plain.add(env, step, dones[env], bool(successes[env]))
         assert [env for env, _ in self.buffer.just_finished] == np.flatnonzero(dones).tolist()
         assert [t.success for _, t in self.buffer.just_finished] == successes[dones].tolist()
         np.testing.assert_array_equal(self.buffer.last_positions(), next_obs)
 
+    def _mark_foreign(self):
+        """Some of the new successes did not go where they were told."""
+        for trajectory, episode in zip(self.buffer.trajectories(True), self.plain.active(True), strict=True):
+            if trajectory.mode == NO_MODE and self.rng.random() < 0.1 and len(self.plain.active(True)) > 5:
+                trajectory.foreign = episode["foreign"] = True
+                off_route = self.rng.random(trajectory.length) < 0.3
+                self.buffer.off_route[trajectory.rows] = off_route
+                for step, off in zip(episode["steps"], off_route, strict=True):
+                    step["off_route"] = bool(off)
+
     @rule()
     def recluster(self):
         successes, failures = self.buffer.trajectories(success=True), self.buffer.trajectories(success=False)
+        if self.plain.n_modes:
+            self._mark_foreign()
+            failures = sorted([*failures, *(t for t in successes if t.foreign)], key=lambda t: t.serial)
+            successes = [t for t in successes if not t.foreign]
         n_modes = min(int(self.rng.integers(1, self.most_modes + 1)), len(successes))
         old = [None, *range(self.plain.n_modes)]
         parents = [old[self.rng.integers(len(old))] for _ in range(n_modes)]
@@ -192,7 +214,7 @@ class BufferMachine(RuleBasedStateMachine):
         n = batch_size // (self.plain.n_modes + 1)
         assert batch.rows.shape == (self.plain.n_modes + 1, n)
         numbers = batch.observations[:, 0].numpy().astype(int).reshape(batch.rows.shape)
-        owner = {s["number"]: e["mode"] for e in self.plain.episodes for s in e["steps"]}
+        owner = {s["number"]: e["mode"] for e in self.plain.episodes if e["trains"] for s in e["steps"]}
         by_number = {step["number"]: step for step in self.plain.steps()}
         assert batch.active.tolist() == [True, *(m in owner.values() for m in range(self.plain.n_modes))]
         improved = self.rng.uniform(-1, 1, batch.actions.shape).astype(np.float32)
@@ -201,7 +223,7 @@ class BufferMachine(RuleBasedStateMachine):
             number, step = numbers[group, column], by_number[numbers[group, column]]
             if group > 0 and batch.active[group]:
                 assert owner[number] == group - 1
-            reward, discount, last = self.plain.window(number, mode if group else exploration)
+            reward, discount, last = self.plain.window(number, mode if group else exploration, group > 0)
             assert batch.rewards[group, column].item() == pytest.approx(reward, rel=1e-4, abs=1e-5)
             assert batch.discounts[group, column].item() == pytest.approx(discount, rel=1e-5)
             np.testing.assert_array_equal(next_obs[group, column], last["next_obs"])
@@ -212,6 +234,14 @@ class BufferMachine(RuleBasedStateMachine):
         for group, column in np.ndindex(batch.rows.shape):
             if batch.active[group]:
                 by_number[numbers[group, column]]["target" if group else "exploratory"] = improved[group, column]
+
+    @rule()
+    def expect_modes(self):
+        """What a model does that was given other parameters."""
+        n_modes = int(self.rng.integers(0, self.most_modes + 1))
+        nobody = [[NO_MODE] * len(self.plain.active(success)) for success in (True, False)]
+        self.buffer.expect_modes(n_modes)
+        self.plain.assign(*nobody, [None] * n_modes)
 
     @rule()
     def interrupt(self):
@@ -239,6 +269,7 @@ class BufferMachine(RuleBasedStateMachine):
             ("exploratory_target_actions", "exploratory"),
             ("dones", "done"),
             ("timeouts", "timeout"),
+            ("off_route", "off_route"),
         ]:
             np.testing.assert_array_equal(getattr(self.buffer, name)[rows], np.stack([step[key] for step in steps]))
         np.testing.assert_allclose(self.buffer.rewards[rows], [step["reward"] for step in steps])
@@ -248,11 +279,11 @@ class BufferMachine(RuleBasedStateMachine):
 
     def _same_trajectories(self, stored):
         for success in (True, False):
-            active = [e for e in self.plain.episodes if e["success"] == success and e["retired"] is None]
-            active.sort(key=lambda e: e["serial"])
+            active = self.plain.active(success)
             trajectories = self.buffer.trajectories(success)
             assert [t.mode for t in trajectories] == [e["mode"] for e in active]
             assert [t.serial for t in trajectories] == [e["serial"] for e in active]
+            assert [t.trains for t in trajectories] == [e["trains"] for e in active]
             for trajectory, episode in zip(trajectories, active, strict=True):
                 assert trajectory.rows.tolist() == [stored[step["number"]] for step in episode["steps"]]
                 assert trajectory.episode_return == pytest.approx(sum(step["reward"] for step in episode["steps"]), abs=1e-4)
@@ -473,7 +504,7 @@ def test_terminal_observation_is_stored_not_the_one_after_the_reset():
         for trajectory in model.replay_buffer.trajectories(success):
             path = model.replay_buffer.full_path(trajectory)[:, 0]
             assert abs(path[0]) <= 0.1
-            assert (np.abs(path[:-1]) < 1).all() and (abs(path[-1]) >= 1) == success
+            assert (np.abs(path[:-1]) < 1).all() and (abs(path[-1]) >= 1) == trajectory.success == success
             # A step is at most half a metre: a reset would be a leap
             assert (np.abs(np.diff(path)) <= 0.5 + 1e-6).all()
             last = trajectory.rows[-1]

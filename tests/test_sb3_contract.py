@@ -77,7 +77,7 @@ def test_predict_shapes_repeatability_and_independence(trained):
     assert state is None
     np.testing.assert_array_equal(trained.predict(observations, deterministic=True)[0], batch)
     single = np.stack([trained.predict(observation, deterministic=True)[0] for observation in observations])
-    np.testing.assert_allclose(single, batch, atol=1e-6)
+    np.testing.assert_allclose(single, batch, atol=1e-4)
     assert not np.array_equal(trained.predict(observations)[0], trained.predict(observations)[0])
     np.testing.assert_array_equal(trained.policy.actor.predict(observations, deterministic=True)[0], batch)
     assert not trained.policy.training
@@ -146,7 +146,7 @@ def test_dict_observations(channel_last, tmp_path):
     model.save(tmp_path / "model")
     np.testing.assert_array_equal(DDiffPG.load(tmp_path / "model").predict(obs, deterministic=True)[0], expected)
     single, _ = model.predict({key: value[0] for key, value in obs.items()}, deterministic=True)
-    np.testing.assert_allclose(single, expected[0], atol=1e-6)
+    np.testing.assert_allclose(single, expected[0], atol=1e-4)
 
 
 def test_dict_observations_need_their_policy():

@@ -1,0 +1,230 @@
+"""What cannot work is refused by name; what breaks on the way stops the run and loses nothing."""
+
+import warnings
+from copy import deepcopy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from environments import SMALL, AnySpaces, BreaksAt, TwoEnds, assert_no_gaps, assert_same_state, small_model, state_of
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_ddiffpg import ClusteringCallback, DDiffPG
+
+NUMBERS_FROM_ONE = (
+    *("n_diffusion_steps", "n_action_gradient_steps", "n_critics", "n_atoms", "mode_n_steps", "exploration_n_steps"),
+    *("recluster_freq", "max_modes", "min_mode_size", "max_successes_per_mode", "max_failures_per_mode"),
+    *("mode_embedding_dim", "batch_size", "buffer_size"),
+)
+BAD_ARGUMENTS = [
+    *((name, value) for name in NUMBERS_FROM_ONE for value in (0, -1, 1.5, None, "many", True)),
+    *((name, value) for name in ("learning_starts", "mode_patience") for value in (-1, 0.5, None, "x")),
+    *((name, value) for name in ("gamma", "tau", "mode_mask_prob", "exploration_fraction") for value in (-0.1, 1.1, None, "x")),
+    *((name, np.nan) for name in ("gamma", "tau", "action_lr", "reward_scale", "v_min", "v_max", "novelty_scale")),
+    *((name, value) for name in ("action_lr", "reward_scale", "max_grad_norm", "exploration_v_max") for value in (0, -1.0, "x")),
+    *(
+        (name, value)
+        for name in ("target_policy_noise", "target_noise_clip", "novelty_scale", "intrinsic_coef", "mode_intrinsic_coef")
+        for value in (-0.1, None, "x", np.nan)
+    ),
+    *((name, value) for name in ("learning_rate", "qf_learning_rate") for value in (-1e-3, "lin_3e-4x", np.nan)),
+    *(("exploration_share", value) for value in (-0.1, 1.5, "half")),
+    *(("distance_threshold", value) for value in (0, -1.0, "auto", np.nan)),
+    *(("v_min", value) for value in (5.0, 6.0, None, "x")),
+    ("v_max", -np.inf),
+    ("gradient_steps", 1.5),
+    ("action_optimizer", "adamw"),
+    ("backup_embedding", "none"),
+    ("linkage", "ward"),
+    ("novelty", "icm"),
+    ("novelty", 3),
+    ("success_key", 5),
+    ("n_steps", 2),
+    ("optimize_memory_usage", True),
+    ("replay_buffer_class", ReplayBuffer),
+    ("replay_buffer_class", "ModeReplayBuffer"),
+    ("train_freq", (1, "minute")),
+    ("train_freq", 1.5),
+    *(("mode_features", value) for value in ([2], [-1], [], [[0]], [0.5], "position", 0, lambda obs: obs.sum())),
+]
+
+
+@pytest.mark.parametrize(("argument", "value"), BAD_ARGUMENTS, ids=[f"{name}-{i}" for i, (name, _) in enumerate(BAD_ARGUMENTS)])
+def test_bad_arguments(argument, value):
+    with pytest.raises(ValueError, match=argument):
+        DDiffPG("MlpPolicy", TwoEnds(), **(SMALL | {argument: value}))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"batch_size": 10, "max_modes": 10}, r"batch_size=10 is smaller than the number of groups.*max_modes \+ 1 = 11"),
+        ({"n_diffusion_steps": 0}, "n_diffusion_steps must be an integer of at least 1, got 0"),
+        ({"gamma": 1.1}, r"gamma must lie in \[0, 1\], got 1.1"),
+        ({"linkage": "ward"}, r"linkage must be one of \['average', .*\], got 'ward'"),
+        ({"novelty": "icm"}, r"novelty must be one of \['rnd', 'counts'\] or a class, got 'icm'"),
+        ({"v_min": 7.0}, r"v_min must be less than v_max, got v_min=7.0, v_max=5.0"),
+        ({"n_steps": 3}, "n_steps=3 is not supported: use mode_n_steps and exploration_n_steps instead"),
+        ({"mode_features": [7]}, r"mode_features=\[7\] exceeds the observation's 2 components"),
+        ({"novelty_kwargs": {"cell_size": -1.0}}, r"novelty_kwargs\['cell_size'\] must be positive, got -1.0"),
+    ],
+)
+def test_messages_say_what_was_given_and_what_is_accepted(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        DDiffPG("MlpPolicy", TwoEnds(), **(SMALL | arguments))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"policy_kwargs": {"net_arc": [16]}},
+        {"novelty_kwargs": {"cellsize": 1.0}},
+        {"replay_buffer_kwargs": {"capacity": 3}},
+    ],
+)
+def test_misspelt_arguments_of_the_parts(arguments):
+    (misspelt,) = next(iter(arguments.values()))
+    with pytest.raises(TypeError, match=misspelt):
+        DDiffPG("MlpPolicy", TwoEnds(), **(SMALL | arguments))
+
+
+def test_mode_features_of_dict_observations():
+    env = AnySpaces(spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": spaces.Discrete(3)}))
+    with pytest.raises(ValueError, match=r"mode_features='c' is not a key of the observation; keys: \['a', 'b'\]"):
+        small_model(env, "MultiInputPolicy", mode_features="c")
+    with pytest.raises(ValueError, match="mode_features must be a key or a callable for dict observations, got indices"):
+        small_model(env, "MultiInputPolicy", mode_features=[0])
+
+
+def test_what_is_given_at_loading_is_checked_too(trained, tmp_path):
+    trained.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="batch_size=3 is smaller"):
+        DDiffPG.load(tmp_path / "model", batch_size=3)
+    with pytest.raises(ValueError, match="linkage must be one of"):
+        DDiffPG.load(tmp_path / "model", linkage="ward")
+
+
+def test_clustering_callback():
+    with pytest.raises(ValueError, match="recluster_freq must be at least 1, got 0"):
+        ClusteringCallback(0)
+
+
+def test_a_batch_too_small_for_its_groups(trained, tmp_path):
+    """Also where it only turns out later: a model with more modes than it would find itself."""
+    trained.save(tmp_path / "model")
+    model = DDiffPG.load(tmp_path / "model", env=DummyVecEnv([TwoEnds] * 4), max_modes=1, batch_size=2)
+    before = deepcopy(model.policy.state_dict())
+    with pytest.raises(ValueError, match="batch_size=2 is smaller than the number of groups, 3"):
+        model.learn(100)
+    assert all(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
+
+
+def test_a_buffer_too_small_for_the_episodes(tmp_path):
+    def limited():
+        env = gym.wrappers.TimeLimit(TwoEnds(), max_episode_steps=300)
+        env.unwrapped.spec = gym.envs.registration.EnvSpec("TwoEnds-v0", max_episode_steps=300)
+        return env
+
+    model = small_model(DummyVecEnv([limited] * 3), buffer_size=899)
+    with pytest.raises(ValueError, match="buffer_size=899 is smaller than one episode of every environment: 3 x 300 steps"):
+        model.learn(10)
+    small_model(DummyVecEnv([limited] * 3), buffer_size=900).learn(10)
+    # Where the length of an episode is not known, once it is noticed
+    endless = small_model(DummyVecEnv([lambda: AnySpaces(limit=10**9)] * 2), buffer_size=30, learning_starts=100)
+    with pytest.raises(ValueError, match=r"buffer_size=30 transitions is too small: .* 2 environment\(s\)"):
+        endless.learn(100)
+    endless.save(tmp_path / "model")
+
+
+def test_a_success_key_that_is_missing():
+    model = small_model(DummyVecEnv([TwoEnds] * 2), success_key="solved")
+    with pytest.raises(ValueError, match=r"success_key='solved' is not in an episode's last info; its keys: \[.*'is_success'"):
+        model.learn(100)
+
+
+# ---------------------------------------------------------------------- values that are not finite
+
+
+def breaking(part, when, broken_env=1, n_envs=3, wrap=lambda env: env):
+    def make(env):
+        return lambda: BreaksAt(TwoEnds(), part, when if env == broken_env else 10**9)
+
+    return wrap(DummyVecEnv([make(env) for env in range(n_envs)]))
+
+
+def numbers(buffer):
+    rows = np.sort(buffer._all.rows[: buffer.size()])
+    arrays = (buffer.observations, buffer.next_observations, buffer.actions, buffer.rewards, buffer.dones)
+    return [array[rows].copy() for array in arrays]
+
+
+@pytest.mark.parametrize("learning_starts", [0, 1000])
+@pytest.mark.parametrize(("part", "when"), [("observation", 1), ("observation", 37), ("reward", 37), ("reset", 1), ("reset", 9)])
+def test_nan_stops_the_run_and_nothing_stored_is_lost(part, when, learning_starts, tmp_path):
+    model = small_model(breaking(part, when), learning_starts=learning_starts)
+    last = []
+
+    def watch(_, __):
+        last[:] = numbers(model.replay_buffer) if model.replay_buffer.size() else []
+        return True
+
+    with pytest.raises(ValueError, match="environment 1 is not finite"):
+        model.learn(1000, callback=watch)
+    n_stored = model.replay_buffer.size()
+    assert n_stored % 3 == 0 and (n_stored > 0) == (when > 1)
+    if n_stored:
+        # All of it is there: what was stored before the last step, and at most that step's
+        stored = numbers(model.replay_buffer)
+        assert len(stored[0]) - len(last[0]) in (0, 3)
+        for array, before in zip(stored, last, strict=True):
+            assert np.isfinite(array).all()
+            np.testing.assert_array_equal(array[: len(before)], before)
+    # Save what was learned; the environment, mended, goes on without a gap
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = DDiffPG.load(tmp_path / "model")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert loaded.replay_buffer.size() == n_stored
+    assert_same_state(state_of(loaded), state_of(model))
+    model.learn(150, reset_num_timesteps=False)
+    assert_no_gaps(model.replay_buffer)
+
+
+def test_nan_behind_a_normalising_wrapper():
+    env = breaking("observation", 20, wrap=lambda env: VecNormalize(env, norm_reward=False))
+    with pytest.raises(ValueError, match="next observation of environment 1 is not finite"):
+        small_model(env).learn(1000)
+
+
+def test_infinite_values_stop_it_too():
+    class Explodes(TwoEnds):
+        def _observation(self):
+            return super()._observation() * (np.inf if self.steps > 2 else 1.0)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numpy's: inf times 0
+        with pytest.raises(ValueError, match="next observation of environment 0 is not finite"):
+            small_model(Explodes()).learn(100)
+
+
+def test_interrupted_by_hand():
+    """Ctrl-C anywhere in a step: the next run begins new episodes, so that none has a gap."""
+
+    class Interrupted(TwoEnds):
+        n_steps = 0
+
+        def step(self, action):
+            type(self).n_steps += 1
+            if self.n_steps == 45:
+                super().step(action)
+                raise KeyboardInterrupt
+            return super().step(action)
+
+    model = small_model(DummyVecEnv([Interrupted] * 2))
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(500)
+    model.learn(100, reset_num_timesteps=False)
+    assert_no_gaps(model.replay_buffer)

@@ -1,0 +1,485 @@
+"""The modes of a model: how they are commanded and shown, and that each keeps its name and belongings for life."""
+
+from collections import Counter
+from copy import deepcopy
+
+import numpy as np
+import pytest
+import torch as th
+from environments import AnySpaces, TwoEnds, fill, small_model, some_observations
+from gymnasium import spaces
+from maze_routes import polyline
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_ddiffpg import Mode, ModeTable
+from sb3_ddiffpg.policies import EXPLORATORY_GROUP, UNCONDITIONED
+
+# Three ways of the same length to three places
+ROUTES = {"up": [(0, 0), (0, 6), (6, 6)], "down": [(0, 0), (0, -6), (6, -6)], "right": [(0, 0), (12, 0)]}
+PLANE = spaces.Box(-20.0, 20.0, (2,))
+
+
+# ---------------------------------------------------------------------- commanding
+
+
+def test_a_commanded_mode_is_its_embedding(trained):
+    observations = some_observations()
+    tensor = th.as_tensor(observations, device=trained.device)
+    actions = []
+    for index, mode in enumerate(trained.modes):
+        embedding = th.as_tensor(mode.embedding, device=trained.device).expand(len(observations), -1)
+        with th.no_grad():
+            expected = trained.actor(tensor, deterministic=True, embeddings=embedding).cpu().numpy()
+        expected = trained.policy.unscale_action(expected)
+        for command in (mode.name, index, np.int64(index), [mode.name] * 10, np.full(10, index)):
+            given, _ = trained.predict(observations, deterministic=True, mode=command)
+            np.testing.assert_array_equal(given, expected)
+        actions.append(expected)
+    with th.no_grad():
+        zero = trained.policy.unscale_action(trained.actor(tensor, deterministic=True).cpu().numpy())
+    unconditioned, state = trained.predict(observations, deterministic=True)
+    np.testing.assert_array_equal(unconditioned, zero)
+    assert state is None
+    mixed, _ = trained.predict(observations[:2], deterministic=True, mode=[trained.modes[1].name, 0])
+    np.testing.assert_allclose(mixed, [actions[1][0], actions[0][1]], atol=1e-4)
+    assert not np.allclose(actions[0], actions[1]) and not np.allclose(actions[0], zero)
+
+
+def test_one_observation(trained):
+    observation = some_observations()[0]
+    for arguments in ({"mode": "mode_0"}, {"episode_start": np.array([True])}, {"mode": [1]}):
+        action, state = trained.predict(observation, deterministic=True, **arguments)
+        assert action.shape == (1,) and state[0].shape == (1,)
+        again, _ = trained.predict(observation, state=state, deterministic=True)
+        np.testing.assert_array_equal(action, again)
+
+
+@pytest.mark.parametrize("mode", ["mode_7", "", 2, -1, True, 0.5, "mode_0 ", ["mode_0", "no_mode"], [0, 5], np.array([3])])
+def test_unknown_modes(trained, mode):
+    with pytest.raises(ValueError, match=r"mode=.* is unknown; the modes are \['mode_\d', 'mode_\d'\] \(or an index below 2\)"):
+        trained.predict(some_observations(2), mode=mode)
+
+
+def test_as_many_modes_as_observations(trained):
+    with pytest.raises(ValueError, match=r"modes.* of 2 for 3 observation"):
+        trained.predict(some_observations(3), mode=[0, 1])
+    with pytest.raises(ValueError, match=r"episode_start of 4 for 3 observation"):
+        trained.predict(some_observations(3), episode_start=np.ones(4, dtype=bool))
+
+
+def test_a_drawn_mode_is_kept_until_the_episode_ends(trained):
+    np.random.seed(0)
+    observations = some_observations(6)
+    commanded = [trained.predict(observations, deterministic=True, mode=mode)[0] for mode in range(2)]
+    starts, state, drawn = np.ones(6, dtype=bool), None, []
+    for step in range(60):
+        before = None if state is None else state[0].copy()
+        actions, state = trained.predict(observations, state=state, episode_start=starts, deterministic=True)
+        (held,) = state
+        assert held.shape == (6,)
+        np.testing.assert_allclose(actions, np.where(held[:, None] == 0, *commanded), atol=1e-4)
+        if before is not None:
+            np.testing.assert_array_equal(held[~starts], before[~starts])
+        drawn += held[starts].tolist()
+        starts = np.arange(6) == step % 6
+    counts = Counter(drawn)
+    assert counts.keys() == {0, 1} and min(counts.values()) > 0.3 * len(drawn)
+    # No new episode: as before
+    again, same = trained.predict(observations, state=state, deterministic=True)
+    np.testing.assert_array_equal(same[0], state[0])
+    assert again.shape == actions.shape
+
+
+def test_a_commanded_mode_is_kept_too(trained):
+    observations = some_observations(3)
+    _, state = trained.predict(observations, mode="mode_1")
+    index = trained.modes.index("mode_1")
+    np.testing.assert_array_equal(state[0], [index] * 3)
+    _, state = trained.predict(observations, state=state, episode_start=np.zeros(3, dtype=bool))
+    np.testing.assert_array_equal(state[0], [index] * 3)
+
+
+def test_a_state_of_another_model_is_noticed(trained):
+    with pytest.raises(ValueError, match="2 modes"):
+        trained.predict(some_observations(2), state=(np.array([0, 7]),))
+
+
+def test_evaluation_with_sb3_draws_a_mode_for_each_episode(trained):
+    held = []
+
+    def watch(local_variables, _):
+        held.append(local_variables["states"][0].copy())
+
+    np.random.seed(0)
+    evaluate_policy(trained, DummyVecEnv([TwoEnds] * 2), n_eval_episodes=20, callback=watch, warn=False)
+    assert set(np.concatenate(held)) == {0, 1}
+
+
+def test_without_modes_nothing_is_commanded():
+    model = small_model(TwoEnds())
+    observations = some_observations(3)
+    expected, _ = model.predict(observations, deterministic=True)
+    given, state = model.predict(observations, episode_start=np.ones(3, dtype=bool), deterministic=True)
+    np.testing.assert_array_equal(given, expected)
+    np.testing.assert_array_equal(state[0], [-1, -1, -1])
+    np.testing.assert_array_equal(model.predict(observations, state=state, deterministic=True)[0], expected)
+    with pytest.raises(ValueError, match=r"mode='mode_0' is unknown; the modes are \[\]"):
+        model.predict(observations, mode="mode_0")
+    assert len(model.modes) == 0 and "no mode yet" in str(model.modes)
+
+
+# ---------------------------------------------------------------------- the table
+
+
+def test_table():
+    modes = [
+        Mode("mode_3", born_at=100, n_trajectories=12, mean_length=21.25, mean_return=1.0),
+        Mode("mode_0", born_at=7, n_trajectories=4),
+    ]
+    modes[0].outcomes.extend([True, True, False, True])
+    table = ModeTable(modes)
+    assert len(table) == 2 and list(table) == modes and table.names == ["mode_3", "mode_0"]
+    assert table["mode_0"] is table[1] is table[-1] is modes[1] and table[:1] == modes[:1]
+    assert table.index("mode_0") == 1 and table.index(0) == 0
+    assert "mode_0" in table and "mode_1" not in table and modes[1] in table and Mode("mode_0", born_at=7) not in table
+    assert table[0].success_rate == 0.75 and np.isnan(table[1].success_rate)
+    lines = str(table).splitlines()
+    assert [line.split()[0] for line in lines] == ["mode", "mode_3", "mode_0"]
+    assert lines[1].split()[1:] == ["12", "0.75", "21.2", "1.00"] and lines[2].split()[1:3] == ["4", "-"]
+    assert len({len(line) for line in lines[1:]}) == 1
+    assert repr(table) == "ModeTable(['mode_3', 'mode_0'])"
+    with pytest.raises(ValueError, match="'mode_9' is unknown"):
+        table["mode_9"]
+    modes[0].outcomes.extend([False] * 100)
+    assert table[0].success_rate == 0.0  # of the latest 100
+
+
+def test_records_are_snapshots(trained):
+    """What a record says must not change under the hands of its reader, nor the policy with it."""
+    record = deepcopy(trained.modes[0])
+    table = trained.modes
+    table[0].embedding[:] = 0.0
+    np.testing.assert_array_equal(trained.modes[0].embedding, record.embedding)
+    assert trained.policy.mode_embeddings[1].abs().sum() > 0
+
+
+# ---------------------------------------------------------------------- re-clustering
+
+
+def planar_model(**changes):
+    settings = {"mode_features": [0, 1], "distance_threshold": 2.0, "mode_patience": 0, "buffer_size": 5000}
+    return small_model(AnySpaces(PLANE), **(settings | changes))
+
+
+def walk(model, route, n, success=True, part=1.0):
+    """The model's environment takes a route n times (or fails on the way)."""
+    rng = np.random.default_rng(len(model.replay_buffer.trajectories(True)))
+    for _ in range(n):
+        line = polyline(ROUTES[route], step=1.0) + rng.uniform(-0.3, 0.3, 2)
+        line = line[: int(part * len(line))] + rng.normal(scale=0.1, size=(int(part * len(line)), 2))
+        fill(model.replay_buffer, [line.astype(np.float32)], success)
+
+
+def route_of(mode):
+    end = mode.representative[-1]
+    return min(ROUTES, key=lambda route: np.abs(ROUTES[route][-1] - end).sum())
+
+
+def belongings(model):
+    """By name: embedding, critics, their targets and moments."""
+    critics = model.critics
+    state = {}
+    for index, mode in enumerate(model.modes):
+        weights = [parameter[index + 1].detach().clone() for parameter in critics.stacked_parameters()]
+        targets = [p[index + 1].detach().clone() for p in model.policy.critics_target.stacked_parameters()]
+        moments = [critics.optimizer.state[p]["exp_avg"][index + 1].clone() for p in critics.stacked_parameters()]
+        state[mode.name] = [th.as_tensor(mode.embedding), *weights, *targets, *moments]
+    return state
+
+
+def same(first, second):
+    return all(th.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.fixture
+def two_routes():
+    """Up and down are modes, and their critics were trained a little."""
+    model = planar_model()
+    walk(model, "up", 4)
+    walk(model, "down", 5)
+    assert model.recluster() == ["mode_0 born", "mode_1 born"]
+    model._setup_learn(1)
+    model.train(5, 32)
+    names = {route_of(mode): mode.name for mode in model.modes}
+    assert names == {"down": "mode_0", "up": "mode_1"}  # the larger one first
+    return model
+
+
+def test_a_birth_leaves_the_others_as_they_are(two_routes):
+    model = two_routes
+    before = belongings(model)
+    exploring = [parameter[0].detach().clone() for parameter in model.critics.stacked_parameters()]
+    embedding_0 = model.policy.mode_embeddings[0].clone()
+    walk(model, "right", 9)
+    walk(model, "up", 3)
+    assert model.recluster() == ["mode_2 born"]
+    assert [(mode.name, route_of(mode)) for mode in model.modes] == [
+        ("mode_2", "right"),
+        ("mode_1", "up"),
+        ("mode_0", "down"),
+    ]
+    after = belongings(model)
+    assert all(same(before[name], after[name]) for name in before)
+    for old, parameter in zip(exploring, model.critics.stacked_parameters(), strict=True):
+        assert th.equal(old, parameter[0])
+    assert th.equal(embedding_0, model.policy.mode_embeddings[0])
+    # The newcomer: hidden layers of the exploratory critics, values near zero, an embedding of its own
+    newcomer = 1
+    assert th.equal(model.critics.weights[0][newcomer], model.critics.weights[0][0])
+    assert model.critics.weights[-1][newcomer].abs().sum() == 0
+    distances = th.cdist(model.policy.mode_embeddings, model.policy.mode_embeddings)
+    assert distances[newcomer, [0, 2, 3]].min() > 0.5
+    # The table
+    by_name = {mode.name: mode for mode in model.modes}
+    assert [by_name[name].n_trajectories for name in ("mode_0", "mode_1", "mode_2")] == [5, 7, 9]
+
+
+def test_a_merge_and_a_split(two_routes):
+    model = two_routes
+    before = belongings(model)
+    model.distance_threshold = 100.0
+    assert model.recluster() == ["mode_1 merged into mode_0"]
+    assert model.modes.names == ["mode_0"] and model.modes[0].n_trajectories == 9
+    assert same(belongings(model)["mode_0"], before["mode_0"])
+    walk(model, "right", 3)
+    model.distance_threshold = 2.0
+    # All were one mode: the largest part goes on with the name, the name of the merged one is not used again
+    assert model.recluster() == ["mode_2 split from mode_0", "mode_3 born"]
+    assert {mode.name: route_of(mode) for mode in model.modes} == {"mode_0": "down", "mode_2": "up", "mode_3": "right"}
+    after = belongings(model)
+    assert same(after["mode_0"], before["mode_0"])
+    n_parameters = len(model.critics.stacked_parameters())
+    heir, parent = after["mode_2"], after["mode_0"]
+    assert same(heir[1 : 2 * n_parameters + 1], parent[1 : 2 * n_parameters + 1])  # critics and targets are copied
+    assert not th.equal(heir[0], parent[0]) and all((moment == 0).all() for moment in heir[2 * n_parameters + 1 :])
+
+
+def test_a_retirement(two_routes):
+    model = two_routes
+    walk(model, "right", 9)
+    model.recluster()
+    model.min_mode_size = 5
+    assert model.recluster() == ["mode_1 retired"]  # four trajectories
+    assert [(mode.name, route_of(mode)) for mode in model.modes] == [("mode_2", "right"), ("mode_0", "down")]
+    # It may come back, under a new name
+    walk(model, "up", 1)
+    assert model.recluster() == ["mode_3 born"]
+
+
+def test_patience_outlasts_a_doubt(two_routes):
+    model = two_routes
+    before = belongings(model)
+    model.mode_patience, model.distance_threshold = 2, 100.0
+    for _ in range(2):
+        assert model.recluster() == [] and set(model.modes.names) == {"mode_0", "mode_1"}
+        assert {mode.name: mode.n_trajectories for mode in model.modes} == {"mode_0": 5, "mode_1": 4}
+    assert all(same(before[name], belongings(model)[name]) for name in before)
+    model.distance_threshold = 2.0
+    assert model.recluster() == []  # all is well again, and the count starts anew
+    model.distance_threshold = 100.0
+    assert [model.recluster() for _ in range(3)] == [[], [], ["mode_1 merged into mode_0"]]
+
+
+def test_target_actions_follow_their_lineage(two_routes):
+    model, buffer = two_routes, two_routes.replay_buffer
+    by_route = {}
+    for trajectory in buffer.trajectories(True):
+        route = route_of(model.modes[trajectory.mode])
+        buffer.target_actions[trajectory.rows] = by_route.setdefault(route, 0.25 * (len(by_route) + 1))
+        buffer.exploratory_target_actions[trajectory.rows] = 0.9
+
+    def improved():
+        """By serial number: whether target actions are still the improved ones, and not the actions again."""
+        kept = {}
+        for trajectory in buffer.trajectories(True):
+            values, actions = buffer.target_actions[trajectory.rows], buffer.actions[trajectory.rows]
+            kept[trajectory.serial] = bool((values == values[0, 0]).all())
+            assert kept[trajectory.serial] or (values == actions).all()
+            assert np.all(buffer.exploratory_target_actions[trajectory.rows] == np.float32(0.9))
+        return kept
+
+    walk(model, "right", 9)
+    buffer.exploratory_target_actions[:] = 0.9
+    model.recluster()  # other indices, the same modes
+    kept = improved()
+    assert [kept[serial] for serial in range(9)] == [True] * 9
+    model.distance_threshold = 100.0
+    model.recluster()  # one mode: heir of the largest, "right"
+    assert not any(improved()[serial] for serial in range(9))
+
+
+def test_environments_follow_names_not_numbers(two_routes):
+    model = two_routes
+    indices = {mode.name: index for index, mode in enumerate(model.modes)}
+    model._env_groups = np.array([indices["mode_0"] + 1, indices["mode_1"] + 1, EXPLORATORY_GROUP, UNCONDITIONED])
+    walk(model, "right", 9)
+    model.recluster()
+    indices = {mode.name: index for index, mode in enumerate(model.modes)}
+    assert indices == {"mode_2": 0, "mode_0": 1, "mode_1": 2}
+    assert model._env_groups.tolist() == [2, 3, EXPLORATORY_GROUP, UNCONDITIONED]
+    model.min_mode_size = 5
+    assert model.recluster() == ["mode_1 retired"]
+    assert model._env_groups.tolist() == [2, UNCONDITIONED, EXPLORATORY_GROUP, UNCONDITIONED]
+
+
+def test_failures_go_to_the_nearest_mode(two_routes):
+    model, buffer = two_routes, two_routes.replay_buffer
+    walk(model, "up", 3, success=False, part=0.7)
+    walk(model, "down", 2, success=False, part=0.8)
+    assert model.recluster() == []
+    owners = [model.modes[trajectory.mode].name for trajectory in buffer.trajectories(success=False)]
+    assert owners == ["mode_1"] * 3 + ["mode_0"] * 2
+    for index, mode in enumerate(model.modes):
+        trajectories = [t for success in (True, False) for t in buffer.trajectories(success) if t.mode == index]
+        rows = buffer.mode_rows[index]
+        assert sorted(rows.rows[: rows.size]) == sorted(np.concatenate([t.rows for t in trajectories]))
+        assert mode.n_trajectories == sum(t.success for t in trajectories)
+
+
+def test_statistics_and_representative(two_routes):
+    model, buffer = two_routes, two_routes.replay_buffer
+    for index, mode in enumerate(model.modes):
+        members = [t for t in buffer.trajectories(True) if t.mode == index]
+        assert mode.mean_length == np.mean([t.length for t in members])
+        assert mode.mean_return == pytest.approx(np.mean([t.episode_return for t in members]))
+        distances = buffer.success_distances(members).mean(axis=1)
+        np.testing.assert_array_equal(mode.representative, buffer.full_path(members[distances.argmin()]))
+
+
+def test_max_modes():
+    model = planar_model(max_modes=2)
+    for route in ROUTES:
+        walk(model, route, 4)
+    model.recluster()
+    assert len(model.modes) == 2
+    # 1 turns clustering off: whatever reaches the goal is the one mode
+    model = planar_model(max_modes=1)
+    walk(model, "up", 2)
+    assert model.recluster() == []  # too few
+    walk(model, "right", 1)
+    assert model.recluster() == ["mode_0 born"] and model.modes[0].n_trajectories == 3
+    walk(model, "down", 4)
+    assert model.recluster() == [] and model.modes.names == ["mode_0"] and model.modes[0].n_trajectories == 7
+
+
+def test_too_few_successes_change_nothing(two_routes):
+    model = two_routes
+    model.min_mode_size = 50
+    before = belongings(model)
+    assert model.recluster() == [] and model.modes.names == ["mode_0", "mode_1"]
+    assert all(same(before[name], belongings(model)[name]) for name in before)
+    empty = planar_model()
+    assert empty.recluster() == [] and len(empty.modes) == 0
+    walk(empty, "up", 2, success=False)
+    assert empty.recluster() == [] and len(empty.modes) == 0
+
+
+def test_a_foreign_trajectory_is_a_failure_of_the_mode_it_was_told_to_follow(two_routes):
+    model, buffer = two_routes, two_routes.replay_buffer
+    walk(model, "up", 2)
+    strayed, obedient = buffer.trajectories(True)[-2:]
+    strayed.commanded, obedient.commanded = "mode_0", "mode_1"
+    assert model.recluster() == []
+    indices = {mode.name: index for index, mode in enumerate(model.modes)}
+    assert strayed.foreign and strayed.mode == indices["mode_0"] and strayed in buffer.trajectories(success=False)
+    assert not obedient.foreign and obedient.mode == indices["mode_1"] and obedient in buffer.trajectories(success=True)
+    # It begins at the common start and then leads away from the route down
+    off_route = buffer.off_route[strayed.rows]
+    assert not off_route[0] and off_route[3:].all() and not buffer.off_route[obedient.rows].any()
+    assert model.recluster() == [] and strayed.mode == {mode.name: i for i, mode in enumerate(model.modes)}["mode_0"]
+
+
+# ---------------------------------------------------------------------- who drives which episode
+
+
+def test_rotation_and_exploration_share(two_routes):
+    model = two_routes
+    np.random.seed(0)
+
+    def shares(progress_remaining, n=3000):
+        model._current_progress_remaining = progress_remaining
+        counts = Counter(model._draw_group() for _ in range(n))
+        exploring = counts.pop(EXPLORATORY_GROUP, 0)
+        if counts:
+            # The modes and the zero embedding take turns
+            assert counts.keys() == {UNCONDITIONED, 1, 2} and max(counts.values()) - min(counts.values()) <= 1
+        return exploring / n
+
+    model.num_timesteps = model.learning_starts
+    assert shares(1.0) == pytest.approx(1 / 3, abs=0.04) and shares(0.31) == pytest.approx(1 / 3, abs=0.04)
+    assert shares(0.29) == 0.0  # after exploration_fraction
+    model.exploration_share = 0.6
+    assert shares(0.0) == pytest.approx(0.6, abs=0.04)
+    model.exploration_share = lambda progress_remaining: progress_remaining / 2
+    assert shares(1.0) == pytest.approx(0.5, abs=0.04) and shares(0.2) == pytest.approx(0.1, abs=0.03)
+    model._modes = []
+    assert shares(0.0) == 1.0  # nothing but exploration is left
+
+
+def test_exploring_episodes_hand_over(two_routes):
+    model = two_routes
+    np.random.seed(0)
+    mean_length = np.mean([mode.mean_length for mode in model.modes])
+    model.n_envs = 6000
+    for explore_then_exploit in (False, True):
+        model.explore_then_exploit = explore_then_exploit
+        model._env_groups = np.repeat([EXPLORATORY_GROUP, 1], 3000)
+        model._env_handed_over = np.zeros(6000, dtype=bool)
+        model._hand_over()
+        left = model._env_groups[:3000] != EXPLORATORY_GROUP
+        np.testing.assert_array_equal(model._env_handed_over[:3000], left)
+        assert (model._env_groups[3000:] == 1).all() and not model._env_handed_over[3000:].any()
+        assert left.mean() == pytest.approx(explore_then_exploit / mean_length, abs=0.02)
+
+
+@pytest.mark.parametrize("explore_then_exploit", [False, True])
+def test_success_rates_are_those_of_commanded_episodes(explore_then_exploit):
+    """Counted by hand while the model trains: episodes that followed one mode from their beginning."""
+    arguments = {"exploration_share": 0.4, "explore_then_exploit": explore_then_exploit}
+    model = small_model(DummyVecEnv([TwoEnds] * 3), **arguments)
+    followed, outcomes = [[] for _ in range(3)], {}
+
+    def watch(local_variables, _):
+        names = {index + 1: mode.name for index, mode in enumerate(model.modes)}
+        warm_up = model.num_timesteps - 3 < model.learning_starts
+        for env in range(3):
+            group = int(model._env_groups[env])
+            began_exploring = warm_up or model._env_handed_over[env]
+            followed[env].append("nobody" if began_exploring else names.get(group, group))
+            if local_variables["dones"][env]:
+                if len(set(followed[env])) == 1 and followed[env][0] in names.values():
+                    success = bool(local_variables["infos"][env]["is_success"])
+                    outcomes.setdefault(followed[env][0], []).append(success)
+                followed[env].clear()
+        return True
+
+    model.learn(700, callback=watch)
+    assert len(model.modes) >= 2 and sum(len(rates) for rates in outcomes.values()) > 20
+    for mode in model.modes:
+        assert list(mode.outcomes) == outcomes.get(mode.name, [])[-100:]
+
+
+def test_random_actions_are_nobodys_doing():
+    model = small_model(DummyVecEnv([TwoEnds] * 3), learning_starts=400, recluster_freq=2)
+    model.learn(390)
+    assert len(model.modes) >= 1 and not any(mode.outcomes for mode in model.modes)
+    assert not any(t.commanded for success in (True, False) for t in model.replay_buffer.trajectories(success))
+
+
+def test_a_second_run_explores_again():
+    model = small_model(DummyVecEnv([TwoEnds] * 8), learning_starts=0, exploration_share=lambda remaining: float(remaining > 0.5))
+    model.learn(400)
+    assert len(model.modes) >= 1 and (model._env_groups != EXPLORATORY_GROUP).all()
+    model._setup_learn(400)
+    assert (model._env_groups == EXPLORATORY_GROUP).all()
