@@ -94,8 +94,8 @@ class DDiffPG(OffPolicyAlgorithm):
     :param exploration_share: Share of episodes that explore, a float or a function of the remaining progress. None:
         ``1 / (M + 1)`` until ``exploration_fraction`` of the training, then 0; always 1 while there is no mode
     :param exploration_fraction: Part of the training that explores, when ``exploration_share`` is None
-    :param explore_then_exploit: Whether an exploring episode hands over to a mode or the zero embedding after a random time
-        (on average the modes' mean length), so that it comes to a goal by a way that no mode would have taken
+    :param explore_then_exploit: Share of the exploring episodes that hand over to a mode or the zero embedding after a random
+        time (on average the modes' mean length), so that they come to a goal by a way that no mode would have taken
     :param novelty: ``"rnd"``, ``"counts"``, or a class with the methods of ``RandomNetworkDistillation``
     :param novelty_kwargs: Further keyword arguments of the novelty measure
     :param novelty_scale: The factor alpha of NovelD
@@ -171,7 +171,7 @@ class DDiffPG(OffPolicyAlgorithm):
         success_key: str | None = None,
         exploration_share: float | Schedule | None = None,
         exploration_fraction: float = 0.7,
-        explore_then_exploit: bool = True,
+        explore_then_exploit: float = 0.5,
         novelty: str | type = "counts",
         novelty_kwargs: dict[str, Any] | None = None,
         novelty_scale: float = 0.5,
@@ -260,6 +260,7 @@ class DDiffPG(OffPolicyAlgorithm):
         self._next_mode_number = 0
         self._env_groups = np.zeros(0, dtype=np.int64)  # the row of the embedding table that drives each environment
         self._env_handed_over = np.zeros(0, dtype=bool)
+        self._env_may_leave = np.zeros(0, dtype=bool)  # exploring episodes that hand over
         self._rotation = 0
         self._resolved_features: Any = None
         self._warned_support = False
@@ -625,6 +626,7 @@ class DDiffPG(OffPolicyAlgorithm):
             self._warn_outside_support(trajectory)
             self._env_groups[env] = self._draw_group()
             self._env_handed_over[env] = False
+            self._env_may_leave[env] = np.random.rand() < self.explore_then_exploit
 
     def _warn_outside_support(self, trajectory: Trajectory) -> None:
         """Once: values that the critics cannot represent make all actions look alike."""
@@ -681,6 +683,7 @@ class DDiffPG(OffPolicyAlgorithm):
         if new_episodes:
             self._env_groups = np.array([self._draw_group() for _ in range(self.n_envs)], dtype=np.int64)
             self._env_handed_over = np.zeros(self.n_envs, dtype=bool)
+            self._env_may_leave = np.random.rand(self.n_envs) < self.explore_then_exploit
         return total_timesteps, callback
 
     def _check_buffer(self, env: VecEnv) -> None:

@@ -40,7 +40,7 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     ),
     (("learning_starts", "mode_patience"), "be an integer of at least 0", lambda value: _is_integer(value) and value >= 0),
     (("gradient_steps",), "be an integer of at least -1", lambda value: _is_integer(value) and value >= -1),
-    (("gamma", "tau", "mode_mask_prob", "exploration_fraction"), "lie in [0, 1]", _is_share),
+    (("gamma", "tau", "mode_mask_prob", "exploration_fraction", "explore_then_exploit"), "lie in [0, 1]", _is_share),
     (("action_lr", "reward_scale", "max_grad_norm"), "be positive", lambda value: _is_number(value) and value > 0),
     (("exploration_v_max",), "be positive and finite", lambda value: _is_number(value) and 0 < value < np.inf),
     (
