@@ -601,10 +601,10 @@ class DDiffPG(OffPolicyAlgorithm):
     def _hand_over(self) -> None:
         """End the exploring part of some episodes: at every step with probability one by the modes' mean length."""
         lengths = [mode.mean_length for mode in self._modes if mode.n_trajectories]
-        if not lengths or not self.explore_then_exploit:
+        if not lengths:
             return
-        leaves = (self._env_groups == EXPLORATORY_GROUP) & (np.random.rand(self.n_envs) < 1 / np.mean(lengths))
-        for env in np.flatnonzero(leaves):
+        leaves = self._env_may_leave & (np.random.rand(self.n_envs) < 1 / np.mean(lengths))
+        for env in np.flatnonzero(leaves & (self._env_groups == EXPLORATORY_GROUP)):
             self._env_groups[env] = self._next_in_turn()
             self._env_handed_over[env] = True
 

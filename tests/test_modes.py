@@ -432,18 +432,18 @@ def test_exploring_episodes_hand_over(two_routes):
     np.random.seed(0)
     mean_length = np.mean([mode.mean_length for mode in model.modes])
     model.n_envs = 6000
-    for explore_then_exploit in (False, True):
-        model.explore_then_exploit = explore_then_exploit
+    for may_leave in (False, True):
+        model._env_may_leave = np.full(6000, may_leave)
         model._env_groups = np.repeat([EXPLORATORY_GROUP, 1], 3000)
         model._env_handed_over = np.zeros(6000, dtype=bool)
         model._hand_over()
         left = model._env_groups[:3000] != EXPLORATORY_GROUP
         np.testing.assert_array_equal(model._env_handed_over[:3000], left)
         assert (model._env_groups[3000:] == 1).all() and not model._env_handed_over[3000:].any()
-        assert left.mean() == pytest.approx(explore_then_exploit / mean_length, abs=0.02)
+        assert left.mean() == pytest.approx(may_leave / mean_length, abs=0.02)
 
 
-@pytest.mark.parametrize("explore_then_exploit", [False, True])
+@pytest.mark.parametrize("explore_then_exploit", [0.0, 0.5, 1.0])
 def test_success_rates_are_those_of_commanded_episodes(explore_then_exploit):
     """Counted by hand while the model trains: episodes that followed one mode from their beginning."""
     arguments = {"exploration_share": 0.4, "explore_then_exploit": explore_then_exploit}
