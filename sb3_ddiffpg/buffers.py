@@ -53,8 +53,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     :param mode_features: See ``ModeFeatures``
     :param max_successes_per_mode: Newest goal-reached trajectories that train a mode; older ones serve exploration only
     :param max_failures_per_mode: Newest failed trajectories that train a mode
-    :param max_length_ratio: A success longer than this times the mode's shortest is a detour: it is remembered for the next
-        clustering, but trains no mode
+    :param max_length_ratio: An uncommanded success longer than this times the mode's shortest is a detour: it is remembered
+        for the next clustering, but trains no mode
     :param min_direct: The mode's shortest successes, so many, are never detours
     :param n_path_points: Points to which a trajectory's path is resampled for clustering
     :param loop_share: Radius within which a path that comes back has made a loop, as a share of the path's extent
@@ -263,14 +263,15 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
 
     def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:
         """
-        A mode's trajectories, and apart from them the successes that are much longer than its shortest one. From detours a
-        critic would piece together a better way than the mode's own route, and the modes would become one.
+        A mode's trajectories, and apart from them the detours: successes that nobody told to follow the mode and that are
+        much longer than its shortest one. From detours a critic would piece together a better way than the mode's own route,
+        and the modes would become one. What the mode itself did slowly it must see, or it would never get better there.
         """
         lengths = np.sort([t.length for t in trajectories if t.success and not t.foreign])
         if not len(lengths):
             return trajectories, []
         limit = max(self.max_length_ratio * lengths[0], lengths[: self.min_direct][-1])
-        is_detour = [t.success and not t.foreign and t.length > limit for t in trajectories]
+        is_detour = [t.success and t.commanded is None and t.length > limit for t in trajectories]
         direct = [t for t, detour in zip(trajectories, is_detour, strict=True) if not detour]
         return direct, [t for t, detour in zip(trajectories, is_detour, strict=True) if detour]
 

@@ -82,13 +82,15 @@ def find_modes(
     n_new = int(labels.max(initial=NO_MODE)) + 1
     inheritance = _with_dormant(match_modes(old_labels, labels, len(modes), n_new), dormant, max_modes)
     heirs = {parent: new for new, parent in enumerate(inheritance.parents) if inheritance.kept[new] and parent is not None}
-    failure_labels = np.array([heirs.get(t.mode, NO_MODE) if t.foreign else NO_MODE for t in failures], dtype=int)
-    strayed = np.flatnonzero([not failure.foreign for failure in failures])
+    told = {mode.name: heirs[old] for old, mode in enumerate(modes) if old in heirs}
+    failure_labels = np.array([told.get(failure.commanded or "", NO_MODE) for failure in failures], dtype=int)
+    # A mode must see its own failures; those that nobody told where to go are shared out by likeness, as in the paper
+    strayed = np.flatnonzero([failure.commanded is None for failure in failures])
     if n_new and len(strayed):
         members = [[buffer.path(successes[i]) for i in np.flatnonzero(labels == mode)] for mode in range(n_new)]
         failure_labels[strayed] = assign_to_nearest([buffer.path(failures[i]) for i in strayed], members, rng)
     if buffer.has_success_signal:
-        foreign = _foreign(modes, heirs, successes, labels)
+        foreign = _foreign(told, successes, labels)
         for i, mode in foreign.items():
             buffer.mark_off_route(successes[i], [successes[j] for j in np.flatnonzero(labels == mode)])
         failures = [*failures, *(successes[i] for i in foreign)]
@@ -133,18 +135,17 @@ def _defend(
     return labels
 
 
-def _foreign(modes: Sequence[Mode], heirs: dict[int, int], successes: list[Trajectory], labels: np.ndarray) -> dict[int, int]:
+def _foreign(told: dict[str, int], successes: list[Trajectory], labels: np.ndarray) -> dict[int, int]:
     """
     The new trajectories that were told to follow one mode, but took the route of another: their index, and the mode that
     they were told to follow. Seen as successes they would tell its critic that any route will do, and the policy of a
     longer route would drift to the shorter one beside it; unseen they would tell it nothing. So it sees them as failures.
     """
-    # A mode that waits for its first trajectory has no route yet that one could leave
-    told = {mode.name: heirs[old] for old, mode in enumerate(modes) if old in heirs and heirs[old] in labels}
     foreign: dict[int, int] = {}
     for i, trajectory in enumerate(successes):
         mode = told.get(trajectory.commanded or "", NO_MODE)
-        if trajectory.mode == NO_MODE and NO_MODE not in (mode, labels[i]) and mode != labels[i]:
+        has_route = mode in labels  # a dormant mode has none yet that one could leave
+        if trajectory.mode == NO_MODE and has_route and NO_MODE not in (mode, labels[i]) and mode != labels[i]:
             foreign[i] = mode
     return foreign
 

@@ -276,7 +276,7 @@ def test_built_in_clustering_runs_first_and_says_what_happened(capsys):
         def _on_rollout_end(self):
             numbers.append(len(self.model.modes))
 
-    model = small_model(DummyVecEnv([TwoEnds] * 4), train_freq=1, recluster_freq=20, verbose=1)
+    model = small_model(DummyVecEnv([TwoEnds] * 4), train_freq=1, recluster_freq=20, min_mode_size=1, verbose=1)
     model.learn(80, callback=Watch())
     assert numbers == [0] * 19 + [len(model.modes)] and len(model.modes) >= 1
     events = "; ".join(f"{mode.name} born" for mode in model.modes)
@@ -378,7 +378,7 @@ def test_networks_without_hidden_layer_are_refused(net_arch):
 )
 def test_optimisers_and_activations(policy_kwargs, tmp_path):
     env = DummyVecEnv([TwoEnds] * 4)
-    model = small_model(env, policy_kwargs={"net_arch": [8], **policy_kwargs}).learn(160)
+    model = small_model(env, policy_kwargs={"net_arch": [8], **policy_kwargs}).learn(250)
     assert len(model.modes) == 2
     model.save(tmp_path / "model")
     loaded = DDiffPG.load(tmp_path / "model", env=env)
