@@ -44,7 +44,10 @@ def run_episodes(
     :return: ``n_episodes`` results, ordered by environment
     """
     share = np.array([n_episodes // env.num_envs + (i < n_episodes % env.num_envs) for i in range(env.num_envs)])
-    features = ModeFeatures(env.observation_space, getattr(model, "_resolved_features", None))
+    selection = getattr(model, "_resolved_features", None)
+    if selection is None and env.has_attr("mode_features"):
+        selection = env.get_attr("mode_features", indices=0)[0]
+    features = ModeFeatures(env.observation_space, selection)
     command = {} if mode is None else {"mode": mode}
     results: list[list[EpisodeResult]] = [[] for _ in range(env.num_envs)]
     obs, state, starts = env.reset(), None, np.ones(env.num_envs, dtype=bool)

@@ -6,7 +6,7 @@ from dtaidistance import dtw_ndim
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_ddiffpg.dtw import LANES, dtw_distances, resample_path
+from sb3_ddiffpg.dtw import LANES, dtw_distances, erase_loops, resample_path
 
 
 def slow_dtw(a: np.ndarray, b: np.ndarray) -> float:
@@ -162,3 +162,23 @@ def test_resampling_checks_its_arguments():
         resample_path(np.zeros((0, 2)), 3)
     with pytest.raises(ValueError, match="path holds values"):
         resample_path(np.array([[0.0, np.nan]]), 3)
+
+
+def test_loops_are_erased_by_hand():
+    # right, a detour up and back, then on to the right
+    path = np.array([[0, 0], [1, 0], [1, 1], [1, 2], [1, 1], [1, 0], [2, 0], [3, 0]], dtype=np.float32)
+    np.testing.assert_array_equal(erase_loops(path, 0.1), [[0, 0], [1, 0], [2, 0], [3, 0]])
+    np.testing.assert_array_equal(erase_loops(path[:4], 0.1), path[:4])
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 10_000), length=st.integers(1, 80), radius=st.floats(0.0, 3.0))
+def test_erased_paths_keep_their_ends_and_come_back_to_no_point(seed, length, radius):
+    path = np.cumsum(np.random.default_rng(seed).normal(size=(length, 2)), axis=0)
+    erased = erase_loops(path, radius)
+    np.testing.assert_array_equal(erased[[0, -1]], path[[0, -1]])
+    steps = [int(np.flatnonzero((path == point).all(axis=1))[0]) for point in erased]
+    assert steps == sorted(set(steps))
+    for i, point in enumerate(erased[:-2]):
+        # what comes after the next point is out of reach of this one
+        assert (np.linalg.norm(erased[i + 2 :] - point, axis=1) > radius).all()

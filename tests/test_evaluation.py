@@ -1,0 +1,72 @@
+"""Complete episodes, and their picture."""
+
+import numpy as np
+import pytest
+from maze_routes import ROUTES
+
+from sb3_ddiffpg.envs import make_vec_env
+from sb3_ddiffpg.evaluation import run_episodes
+from sb3_ddiffpg.plots import plot_routes
+
+
+class Scripted:
+    """Goes to the goal of V1 round the block, above or below as it is told, or runs into the wall for ever."""
+
+    def __init__(self) -> None:
+        self.commands: list = []
+
+    def predict(self, obs, state=None, episode_start=None, deterministic=False, mode=None):
+        self.commands.append(mode)
+        side = {"above": 1.0, "below": -1.0, "nowhere": 0.0}[mode]
+        x, y = obs[:, 0], obs[:, 1]
+        leave = (x > -2.0) & (np.abs(y) < 3.5)
+        back = x < -6.5
+        action = np.stack([np.where(leave & (side != 0), 0.0, -1.0), np.where(leave, side, 0.0)], axis=1)
+        action[back] = np.clip(np.stack([-8.0 - x[back], -y[back]], axis=1), -1, 1)
+        return action.astype(np.float32), state
+
+
+@pytest.mark.parametrize(("mode", "label"), [("above", "0:a"), ("below", "0:-")])
+def test_episodes_are_complete_and_carry_their_route(mode, label):
+    model = Scripted()
+    env = make_vec_env("PointMazeV1-v0", 3, seed=0, start_noise=0.0)
+    episodes = run_episodes(model, env, 7, mode=mode)
+    assert len(episodes) == 7 and set(model.commands) == {mode}
+    for episode in episodes:
+        assert episode.success and episode.label == label and episode.episode_return == 1.0
+        assert episode.path.shape == (episode.length + 1, 2)
+        np.testing.assert_allclose(episode.path[0], [0, 0])
+        assert np.linalg.norm(episode.path[-1] - [-8, 0]) <= 1.0  # the terminal position, not the next start
+        assert np.abs(np.diff(episode.path, axis=0)).max() <= 0.8 + 1e-6
+    assert ("V1", label) in ROUTES
+
+
+def test_failures_last_until_the_time_limit():
+    env = make_vec_env("PointMazeV1-v0", 2, seed=0, start_noise=0.0)
+    episodes = run_episodes(Scripted(), env, 2, mode="nowhere")
+    assert [(e.success, e.label, e.length, e.episode_return) for e in episodes] == [(False, None, 150, 0.0)] * 2
+
+
+def test_short_episodes_are_not_favoured():
+    """Every environment contributes the same number, however long its episodes are."""
+
+    class Mixed(Scripted):
+        def predict(self, obs, **kwargs):
+            fast = super().predict(obs, mode="above")[0]
+            fast[1] = [1.0, 0.0]  # environment 1 never arrives
+            return fast, None
+
+    env = make_vec_env("PointMazeV1-v0", 2, seed=0, start_noise=0.0)
+    assert [episode.success for episode in run_episodes(Mixed(), env, 6)] == [True] * 3 + [False] * 3
+
+
+def test_routes_are_drawn_over_the_maze():
+    env = make_vec_env("PointMazeV1-v0", 2, seed=0, start_noise=0.0)
+    model = Scripted()
+    episodes = {mode: run_episodes(model, env, 2, mode=mode) for mode in ("above", "nowhere")}
+    figure = plot_routes(episodes, maze=env.get_attr("maze", indices=0)[0])
+    lines = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 1]
+    assert [line.get_linestyle() for line in lines] == ["-", "-", "--", "--"]
+    assert lines[0].get_color() == lines[1].get_color() != lines[2].get_color()
+    np.testing.assert_allclose(lines[0].get_xydata(), episodes["above"][0].path)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["start", "above", "nowhere"]
