@@ -22,9 +22,17 @@ NUMBERS_FROM_ONE = (
 BAD_ARGUMENTS = [
     *((name, value) for name in NUMBERS_FROM_ONE for value in (0, -1, 1.5, None, "many", True)),
     *((name, value) for name in ("learning_starts", "mode_patience") for value in (-1, 0.5, None, "x")),
-    *((name, value) for name in ("gamma", "tau", "mode_mask_prob", "exploration_fraction") for value in (-0.1, 1.1, None, "x")),
+    *(
+        (name, value)
+        for name in ("gamma", "tau", "mode_mask_prob", "exploration_fraction")
+        for value in (-0.1, 1.1, None, "x")
+    ),
     *((name, np.nan) for name in ("gamma", "tau", "action_lr", "reward_scale", "v_min", "v_max", "novelty_scale")),
-    *((name, value) for name in ("action_lr", "reward_scale", "max_grad_norm", "exploration_v_max") for value in (0, -1.0, "x")),
+    *(
+        (name, value)
+        for name in ("action_lr", "reward_scale", "max_grad_norm", "exploration_v_max")
+        for value in (0, -1.0, "x")
+    ),
     *(
         (name, value)
         for name in ("target_policy_noise", "target_noise_clip", "novelty_scale", "intrinsic_coef", "mode_intrinsic_coef")
@@ -52,7 +60,9 @@ BAD_ARGUMENTS = [
 ]
 
 
-@pytest.mark.parametrize(("argument", "value"), BAD_ARGUMENTS, ids=[f"{name}-{i}" for i, (name, _) in enumerate(BAD_ARGUMENTS)])
+@pytest.mark.parametrize(
+    ("argument", "value"), BAD_ARGUMENTS, ids=[f"{name}-{i}" for i, (name, _) in enumerate(BAD_ARGUMENTS)]
+)
 def test_bad_arguments(argument, value):
     with pytest.raises(ValueError, match=argument):
         DDiffPG("MlpPolicy", TwoEnds(), **(SMALL | {argument: value}))
@@ -162,7 +172,9 @@ def numbers(buffer):
 
 
 @pytest.mark.parametrize("learning_starts", [0, 1000])
-@pytest.mark.parametrize(("part", "when"), [("observation", 1), ("observation", 37), ("reward", 37), ("reset", 1), ("reset", 9)])
+@pytest.mark.parametrize(
+    ("part", "when"), [("observation", 1), ("observation", 37), ("reward", 37), ("reset", 1), ("reset", 9)]
+)
 def test_nan_stops_the_run_and_nothing_stored_is_lost(part, when, learning_starts, tmp_path):
     model = small_model(breaking(part, when), learning_starts=learning_starts)
     last = []

@@ -182,7 +182,7 @@ class BufferMachine(RuleBasedStateMachine):
     def _mark_foreign(self):
         """Some of the new successes did not go where they were told."""
         for trajectory, episode in zip(self.buffer.trajectories(True), self.plain.active(True), strict=True):
-            if trajectory.mode == NO_MODE and self.rng.random() < 0.1 and len(self.plain.active(True)) > 5:
+            if trajectory.mode == NO_MODE and self.rng.random() < 0.3 and len(self.plain.active(True)) > 3:
                 trajectory.foreign = episode["foreign"] = True
                 off_route = self.rng.random(trajectory.length) < 0.3
                 self.buffer.off_route[trajectory.rows] = off_route
@@ -378,6 +378,63 @@ def test_modes_keep_their_newest_and_what_they_let_go_is_evicted_first():
     # 60 fit: of the retired 0, 1, 2 the two oldest made room, although the group of new ones is larger than the mode
     assert [trajectory.serial for trajectory in buffer.trajectories(True)] == [3, 4, 5, 6, 7]
     assert set(buffer.observations[buffer._all.rows[: buffer.size()], 0]) == {2, 3, 4, 5, 6, 7}
+
+
+def straight(length):
+    return np.stack([np.linspace(0, 8, length + 1), np.zeros(length + 1)], axis=1).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("lengths", "detours"),
+    [
+        ([10, 16, 12, 30, 10, 15, 11, 10], [16, 30]),  # more than half as long again as the shortest
+        ([10, 16, 12, 30, 10], []),  # the five shortest in any case
+        ([10, 16, 12, 30, 10, 40], [40]),
+    ],
+)
+def test_a_mode_remembers_its_detours_but_does_not_learn_from_them(lengths, detours):
+    buffer = make_buffer(500, mode_features=[0, 1])
+    fill(buffer, [straight(length) for length in lengths])
+    fill(buffer, [straight(100)], success=False)
+    successes, failures = buffer.trajectories(True), buffer.trajectories(False)
+    buffer.assign_modes(successes, np.zeros(len(lengths)), failures, np.zeros(1), [None])
+    assert [t.length for t in successes if not t.trains] == detours
+    assert failures[0].trains and all(t.mode == 0 for t in successes)
+    assert buffer.trajectories(True) == successes  # they take part in the next clustering
+    assert buffer.mode_rows[0].size == sum(lengths) - sum(detours) + 100
+    assert set(buffer.sample_modes(400, GAMMA, 1, 1).rows[1]) <= set(np.concatenate([t.rows for t in successes + failures if t.trains]))
+
+
+def test_a_mode_is_shown_a_foreign_trajectory_as_a_way_off_its_route():
+    """Up to where it leaves the route it is as any other; from there on it is worth nothing, and the end."""
+    buffer = make_buffer(500, mode_features=[0, 1])
+    leaves = np.array([[0, 0], [1, 0], [2, 0], [3, 2], [4, 4], [5, 4], [8, 0]], dtype=np.float32)
+    fill(buffer, [straight(8)] * 3)
+    fill(buffer, [leaves], reward=5.0)
+    *members, foreign = buffer.trajectories(True)
+    buffer.mark_off_route(foreign, members)
+    # The route is 8 m long: a tenth of that is still on it
+    assert buffer.off_route[foreign.rows].tolist() == [False, False, True, True, True, False]
+    buffer.assign_modes(members, np.zeros(3), [foreign], np.zeros(1), [None])
+    assert foreign in buffer.trajectories(False) and foreign not in buffer.trajectories(True) and foreign.trains
+    batch = buffer.sample_modes(600, GAMMA, 3, 3)
+    expected = {  # reward and discount of three steps from each, for the mode and for exploration
+        0: ((0.0, 0.0), (0.0, GAMMA**3)),
+        1: ((0.0, 0.0), (0.0, GAMMA**3)),
+        2: ((0.0, 0.0), (0.0, GAMMA**3)),
+        3: ((0.0, 0.0), (GAMMA**2 * 5, 0.0)),
+        4: ((0.0, 0.0), (GAMMA * 5, 0.0)),
+        5: ((5.0, 0.0), (5.0, 0.0)),
+    }
+    order = {row: k for k, row in enumerate(foreign.rows.tolist())}
+    seen = set()
+    for group, column in np.argwhere(np.isin(batch.rows, foreign.rows)):
+        k = order[batch.rows[group, column]]
+        reward, discount = expected[k][0 if group else 1]
+        assert batch.rewards[group, column].item() == pytest.approx(reward)
+        assert batch.discounts[group, column].item() == pytest.approx(discount)
+        seen.add((group > 0, k))
+    assert len(seen) == 12
 
 
 def test_full_of_unfinished_episodes_is_a_clear_error_that_loses_nothing():

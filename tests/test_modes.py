@@ -57,7 +57,9 @@ def test_one_observation(trained):
 
 @pytest.mark.parametrize("mode", ["mode_7", "", 2, -1, True, 0.5, "mode_0 ", ["mode_0", "no_mode"], [0, 5], np.array([3])])
 def test_unknown_modes(trained, mode):
-    with pytest.raises(ValueError, match=r"mode=.* is unknown; the modes are \['mode_\d', 'mode_\d'\] \(or an index below 2\)"):
+    with pytest.raises(
+        ValueError, match=r"mode=.* is unknown; the modes are \['mode_\d', 'mode_\d'\] \(or an index below 2\)"
+    ):
         trained.predict(some_observations(2), mode=mode)
 
 
@@ -478,7 +480,9 @@ def test_random_actions_are_nobodys_doing():
 
 
 def test_a_second_run_explores_again():
-    model = small_model(DummyVecEnv([TwoEnds] * 8), learning_starts=0, exploration_share=lambda remaining: float(remaining > 0.5))
+    model = small_model(
+        DummyVecEnv([TwoEnds] * 8), learning_starts=0, exploration_share=lambda remaining: float(remaining > 0.5)
+    )
     model.learn(400)
     assert len(model.modes) >= 1 and (model._env_groups != EXPLORATORY_GROUP).all()
     model._setup_learn(400)

@@ -141,7 +141,9 @@ def test_new_modes_of_a_resumed_run_get_names_of_their_own(saved):
     for _ in range(4):
         for k in range(4):
             obs = np.full((4, 2), 10.0 * k, dtype=np.float32)
-            loaded.replay_buffer.add(obs, obs + 10, np.zeros((4, 1)), np.ones(4), np.full(4, k == 3), [{"is_success": True}] * 4)
+            loaded.replay_buffer.add(
+                obs, obs + 10, np.zeros((4, 1)), np.ones(4), np.full(4, k == 3), [{"is_success": True}] * 4
+            )
     loaded.recluster()
     assert all(name in taken or int(name.removeprefix("mode_")) >= len(taken) for name in loaded.modes.names)
     assert set(model.modes.names) <= set(loaded.modes.names)
