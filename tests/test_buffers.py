@@ -402,7 +402,9 @@ def test_a_mode_remembers_its_detours_but_does_not_learn_from_them(lengths, deto
     assert failures[0].trains and all(t.mode == 0 for t in successes)
     assert buffer.trajectories(True) == successes  # they take part in the next clustering
     assert buffer.mode_rows[0].size == sum(lengths) - sum(detours) + 100
-    assert set(buffer.sample_modes(400, GAMMA, 1, 1).rows[1]) <= set(np.concatenate([t.rows for t in successes + failures if t.trains]))
+    assert set(buffer.sample_modes(400, GAMMA, 1, 1).rows[1]) <= set(
+        np.concatenate([t.rows for t in successes + failures if t.trains])
+    )
 
 
 def test_a_mode_is_shown_a_foreign_trajectory_as_a_way_off_its_route():
