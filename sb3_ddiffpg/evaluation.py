@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_ddiffpg.features import ModeFeatures
 from sb3_ddiffpg.trajectories import SUCCESS_KEYS
@@ -50,20 +50,24 @@ def run_episodes(
     features = ModeFeatures(env.observation_space, selection)
     command = {} if mode is None else {"mode": mode}
     results: list[list[EpisodeResult]] = [[] for _ in range(env.num_envs)]
+    # Positions are compared in metres, whatever a normalising wrapper shows the networks
+    normalizer = unwrap_vec_normalize(env)
     obs, state, starts = env.reset(), None, np.ones(env.num_envs, dtype=bool)
-    paths: list[list[np.ndarray]] = [[position] for position in features(_original(env, obs))]
+    original = obs if normalizer is None else normalizer.get_original_obs()
+    paths: list[list[np.ndarray]] = [[position] for position in features(original)]  # type: ignore[arg-type]
     returns = np.zeros(env.num_envs)
     while any(len(done) < wanted for done, wanted in zip(results, share, strict=True)):
         actions, state = model.predict(obs, state=state, episode_start=starts, deterministic=deterministic, **command)
         obs, rewards, starts, infos = env.step(actions)
-        returns += rewards
-        positions = features(_original(env, obs))
+        returns += rewards if normalizer is None else normalizer.get_original_reward()
+        positions = features(obs if normalizer is None else normalizer.get_original_obs())  # type: ignore[arg-type]
         for i in range(env.num_envs):
             if not starts[i]:
                 paths[i].append(positions[i])
                 continue
             terminal = infos[i].get("terminal_observation")
             if terminal is not None:
+                terminal = terminal if normalizer is None else normalizer.unnormalize_obs(terminal)
                 batch = {key: value[None] for key, value in terminal.items()} if isinstance(terminal, dict) else terminal[None]
                 paths[i].append(features(batch)[0])
             success = next((bool(infos[i][key]) for key in SUCCESS_KEYS if key in infos[i]), False)
@@ -71,8 +75,3 @@ def run_episodes(
             results[i].append(episode)
             paths[i], returns[i] = [positions[i]], 0.0
     return [episode for done, wanted in zip(results, share, strict=True) for episode in done[:wanted]]
-
-
-def _original(env: VecEnv, obs: Any) -> Any:
-    """Positions are compared in metres, whatever a normalising wrapper shows the networks."""
-    return env.get_original_obs() if hasattr(env, "get_original_obs") else obs

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from maze_routes import ROUTES
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.evaluation import run_episodes
@@ -58,6 +59,21 @@ def test_short_episodes_are_not_favoured():
 
     env = make_vec_env("PointMazeV1-v0", 2, seed=0, start_noise=0.0)
     assert [episode.success for episode in run_episodes(Mixed(), env, 6)] == [True] * 3 + [False] * 3
+
+
+def test_paths_are_in_metres_behind_a_normalising_wrapper():
+    """The terminal observation too, which VecNormalize hides in ``info``."""
+    plain = make_vec_env("PointMazeV1-v0", 2, seed=0, start_noise=0.0)
+    normalised = VecNormalize(make_vec_env("PointMazeV1-v0", 2, seed=0, start_noise=0.0))
+
+    class Unnormalising(Scripted):
+        def predict(self, obs, **kwargs):
+            return super().predict(normalised.get_original_obs(), **kwargs)
+
+    expected = run_episodes(Scripted(), plain, 4, mode="above")
+    for episode, same in zip(run_episodes(Unnormalising(), normalised, 4, mode="above"), expected, strict=True):
+        np.testing.assert_allclose(episode.path, same.path, atol=1e-4)
+        assert episode.episode_return == same.episode_return == 1.0
 
 
 def test_routes_are_drawn_over_the_maze():

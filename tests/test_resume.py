@@ -100,6 +100,16 @@ def test_episodes_in_progress_do_not_go_on_in_other_environments(saved):
     assert_no_gaps(loaded.replay_buffer)
 
 
+def test_an_older_buffer_of_the_same_model(saved):
+    """Between the moment it was saved and now, the environments went on."""
+    model, folder = saved
+    model.mode_patience = 1000
+    model.learn(50, reset_num_timesteps=False)
+    model.load_replay_buffer(folder / "buffer")
+    model.learn(50, reset_num_timesteps=False)
+    assert_no_gaps(model.replay_buffer)
+
+
 def test_a_stopped_run_goes_on_without_a_gap():
     """SB3 does not store the step at which a callback stops it (its issue 2056)."""
     model = small_model(two_ends(2))

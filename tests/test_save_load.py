@@ -24,6 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import ClusteringCallback, DDiffPG, DiffusionPolicy, Mode
+from sb3_ddiffpg.noise import SpreadNormalActionNoise
 
 
 def test_save_and_load_random_parameters(tmp_path, trained):
@@ -214,11 +215,13 @@ def test_loaded_arguments_can_be_changed(trained, tmp_path):
 
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_load_with_another_number_of_environments(n_envs, tmp_path):
-    small_model(DummyVecEnv([TwoEnds] * 2)).learn(160).save(tmp_path / "model")
+    noise = SpreadNormalActionNoise(2, 1, low=0.1, high=0.2)
+    small_model(DummyVecEnv([TwoEnds] * 2), action_noise=noise).learn(160).save(tmp_path / "model")
     model = DDiffPG.load(tmp_path / "model", env=DummyVecEnv([TwoEnds] * n_envs))
     assert model.n_envs == n_envs == model.replay_buffer.n_envs
     model.learn(60, reset_num_timesteps=False)
     assert model.num_timesteps >= 220
+    assert (model.action_noise.low, model.action_noise.high, len(model.action_noise.sigma)) == (0.1, 0.2, n_envs)
 
 
 def test_set_env():
