@@ -90,7 +90,7 @@ def find_modes(
         members = [[buffer.path(successes[i]) for i in np.flatnonzero(labels == mode)] for mode in range(n_new)]
         failure_labels[strayed] = assign_to_nearest([buffer.path(failures[i]) for i in strayed], members, rng)
     if buffer.has_success_signal:
-        foreign = _foreign(told, successes, labels)
+        foreign = _foreign(told, successes, labels, set(heirs.values()))
         for i, mode in foreign.items():
             buffer.mark_off_route(successes[i], [successes[j] for j in np.flatnonzero(labels == mode)])
         failures = [*failures, *(successes[i] for i in foreign)]
@@ -135,17 +135,21 @@ def _defend(
     return labels
 
 
-def _foreign(told: dict[str, int], successes: list[Trajectory], labels: np.ndarray) -> dict[int, int]:
+def _foreign(
+    told: dict[str, int], successes: list[Trajectory], labels: np.ndarray, established: set[int]
+) -> dict[int, int]:
     """
     The new trajectories that were told to follow one mode, but took the route of another: their index, and the mode that
     they were told to follow. Seen as successes they would tell its critic that any route will do, and the policy of a
     longer route would drift to the shorter one beside it; unseen they would tell it nothing. So it sees them as failures.
+
+    Those on the route of no mode so far have discovered one. They stay with it, or it would be born without trajectories.
     """
     foreign: dict[int, int] = {}
     for i, trajectory in enumerate(successes):
         mode = told.get(trajectory.commanded or "", NO_MODE)
         has_route = mode in labels  # a dormant mode has none yet that one could leave
-        if trajectory.mode == NO_MODE and has_route and NO_MODE not in (mode, labels[i]) and mode != labels[i]:
+        if trajectory.mode == NO_MODE and has_route and labels[i] in established - {mode}:
             foreign[i] = mode
     return foreign
 

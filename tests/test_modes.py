@@ -402,6 +402,22 @@ def test_a_foreign_trajectory_is_a_failure_of_the_mode_it_was_told_to_follow(two
     assert model.recluster() == [] and strayed.mode == {mode.name: i for i, mode in enumerate(model.modes)}["mode_0"]
 
 
+def test_a_route_that_was_found_against_orders_is_a_mode(two_routes):
+    """All of its trajectories were told to follow another mode: as foreign ones they would leave it without any."""
+    model, buffer = two_routes, two_routes.replay_buffer
+    walk(model, "right", 4)
+    discoverers = buffer.trajectories(True)[-4:]
+    for trajectory in discoverers:
+        trajectory.commanded = "mode_0"
+    assert model.recluster() == ["mode_2 born"]
+    assert model.modes["mode_2"].n_trajectories == 4 and not any(trajectory.foreign for trajectory in discoverers)
+    # From now on it is known, and who takes it against orders strays
+    walk(model, "right", 1)
+    (strayed,) = buffer.trajectories(True)[-1:]
+    strayed.commanded = "mode_0"
+    assert model.recluster() == [] and strayed.foreign
+
+
 # ---------------------------------------------------------------------- who drives which episode
 
 
