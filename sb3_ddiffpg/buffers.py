@@ -22,8 +22,8 @@ class ModeBatch(NamedTuple):
 
     Observations are [N, ...] (or dicts of such), ``actions``, ``target_actions`` [G, n, action_dim], ``rewards`` and
     ``discounts`` [G, n]. ``active`` [G] is False for a mode without any transition, whose rows are a stand-in that must
-    not train it. ``rows`` [G, n] and ``windows`` [G, n, n_steps] (-1 where a window ends early) say where in
-    the buffer the transitions lie.
+    not train it. ``imitated`` [G, n] is False for these and for steps off the mode's route, which the policy must not learn.
+    ``rows`` [G, n] and ``windows`` [G, n, n_steps] (-1 where a window ends early) say where in the buffer the transitions lie.
     """
 
     observations: Any
@@ -33,6 +33,7 @@ class ModeBatch(NamedTuple):
     rewards: th.Tensor
     discounts: th.Tensor
     active: th.Tensor
+    imitated: th.Tensor
     rows: np.ndarray
     windows: np.ndarray
 
@@ -324,6 +325,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         # For its mode a step off the route ends the episode without reward, so that no way back is worth anything
         lost = np.logical_or.accumulate(self.off_route[windows] & present, axis=-1)
         lost[EXPLORATORY] = False
+        # There no action is better than another: the target action would stay what led away
+        imitated = active[:, None] & ~lost[..., 0]
         rewards = (np.where(present & ~lost, rewards, 0.0) * powers).sum(axis=-1)  # [G, n]
         lengths = present.sum(axis=-1)
         last = np.take_along_axis(windows, lengths[..., None] - 1, axis=-1)[..., 0]
@@ -340,6 +343,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             rewards=self.to_torch(rewards.astype(np.float32)),
             discounts=self.to_torch(discounts.astype(np.float32)),
             active=self.to_torch(active),
+            imitated=self.to_torch(imitated),
             rows=rows,
             windows=windows,
         )

@@ -468,7 +468,7 @@ class DDiffPG(OffPolicyAlgorithm):
 
     def _update_actor(self, batch: ModeBatch, target_actions: th.Tensor) -> th.Tensor:
         condition = self.actor.condition(batch.observations, self._row_embeddings(batch, masked=True))
-        weights = batch.active.float()[:, None].expand(batch.rows.shape).reshape(-1)
+        weights = batch.imitated.flatten().float()
         loss = self.actor.diffusion.loss(target_actions.flatten(0, 1), condition, weights=weights)
         self.actor.optimizer.zero_grad(set_to_none=True)
         loss.backward()

@@ -148,7 +148,7 @@ def _foreign(
     foreign: dict[int, int] = {}
     for i, trajectory in enumerate(successes):
         mode = told.get(trajectory.commanded or "", NO_MODE)
-        has_route = mode in labels  # a dormant mode has none yet that one could leave
+        has_route = mode != NO_MODE and mode in labels  # a dormant mode has none yet that one could leave
         if trajectory.mode == NO_MODE and has_route and labels[i] in established - {mode}:
             foreign[i] = mode
     return foreign

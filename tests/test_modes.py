@@ -415,7 +415,11 @@ def test_a_route_that_was_found_against_orders_is_a_mode(two_routes):
     walk(model, "right", 1)
     (strayed,) = buffer.trajectories(True)[-1:]
     strayed.commanded = "mode_0"
+    walk(model, "right", 1)
+    buffer.trajectories(True)[-1].commanded = "of a mode that has ended"
+    fill(buffer, [np.linspace((0, 0), (-6, 6), 7, dtype=np.float32)])  # an outlier
     assert model.recluster() == [] and strayed.foreign
+    assert [trajectory for trajectory in buffer.trajectories(False) if trajectory.foreign] == [strayed]
 
 
 # ---------------------------------------------------------------------- who drives which episode

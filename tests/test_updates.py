@@ -101,6 +101,26 @@ def test_groups_without_data_train_nothing(tmp_path):
     assert not np.array_equal(model.replay_buffer.exploratory_target_actions, buffer.exploratory_target_actions)
 
 
+def test_the_policy_does_not_imitate_steps_off_the_route():
+    """For the mode only: to the exploratory group all steps are alike."""
+    model = trained_model()
+    buffer = model.replay_buffer
+    buffer.off_route[: buffer.pos : 3] = True
+    batch = draw(model)
+    off_route = buffer.off_route[batch.rows]
+    assert off_route.any(axis=1).all()
+    off_route[0] = False
+    np.testing.assert_array_equal(batch.imitated.numpy(), ~off_route)
+    start, updated = deepcopy(model.get_parameters()), []
+    for changed in (np.zeros_like(off_route), off_route, ~off_route):
+        model.set_parameters(start)
+        th.manual_seed(0)
+        model._update_actor(batch, th.where(th.as_tensor(changed)[..., None], -batch.target_actions, batch.target_actions))
+        updated.append(parameters_of(model.actor))
+    same = [all(th.equal(a, b) for a, b in zip(updated[0], other, strict=True)) for other in updated[1:]]
+    assert same == [True, False]
+
+
 @pytest.mark.parametrize("probability", [0.0, 0.3, 1.0])
 def test_embeddings_are_masked_as_a_whole_and_exploration_never(probability):
     th.manual_seed(0)
