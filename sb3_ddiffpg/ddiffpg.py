@@ -21,6 +21,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.utils import FloatSchedule, polyak_update, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, Behavior
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.callbacks import ClusteringCallback
 from sb3_ddiffpg.clustering import cluster
@@ -28,7 +29,7 @@ from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, noveld_reward
 from sb3_ddiffpg.modes import Mode, ModeTable, succeed
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
-from sb3_ddiffpg.policies import EXPLORATORY_GROUP, UNCONDITIONED, DiffusionActor, DiffusionPolicy
+from sb3_ddiffpg.policies import DiffusionActor, DiffusionPolicy
 from sb3_ddiffpg.reclustering import find_modes
 from sb3_ddiffpg.target_actions import ascend
 from sb3_ddiffpg.trajectories import Trajectory
@@ -258,10 +259,7 @@ class DDiffPG(OffPolicyAlgorithm):
         self.n_rollouts = 0
         self._modes: list[Mode] = []
         self._next_mode_number = 0
-        self._env_groups = np.zeros(0, dtype=np.int64)  # the row of the embedding table that drives each environment
-        self._env_handed_over = np.zeros(0, dtype=bool)
-        self._env_may_leave = np.zeros(0, dtype=bool)  # exploring episodes that hand over
-        self._rotation = 0
+        self._behavior = Behavior(0)
         self._resolved_features: Any = None
         self._warned_support = False
 
@@ -518,7 +516,8 @@ class DDiffPG(OffPolicyAlgorithm):
         self._modes, events, self._next_mode_number = succeed(
             self._modes, found.inheritance, self.num_timesteps, self._next_mode_number
         )
-        self._follow_names(old_names)
+        names = [mode.name for mode in self._modes]
+        self._behavior.follow([names.index(name) if name in names else None for name in old_names])
         found.describe(self._modes, self.replay_buffer)
         self.logger.record("modes/n_modes", len(self._modes))
         for mode in self._modes:
@@ -531,12 +530,6 @@ class DDiffPG(OffPolicyAlgorithm):
         if self.max_modes == 1:
             return np.zeros(len(distances), dtype=int)  # clustering off: whatever reaches the goal is the one mode
         return cluster(distances, self.distance_threshold, self.linkage, self.max_modes, self.min_mode_size)
-
-    def _follow_names(self, old_names: list[str]) -> None:
-        """Environments go on with the mode they follow; its index may have changed, or it is gone."""
-        names = [mode.name for mode in self._modes]
-        new_group = {old + 1: names.index(name) + 1 if name in names else UNCONDITIONED for old, name in enumerate(old_names)}
-        self._env_groups = np.array([new_group.get(group, group) for group in self._env_groups.tolist()], dtype=np.int64)
 
     # ------------------------------------------------------------------ acting
 
@@ -578,37 +571,19 @@ class DDiffPG(OffPolicyAlgorithm):
         if self.num_timesteps < learning_starts:
             scaled_action = np.random.uniform(-1.0, 1.0, size=shape).astype(np.float32)
         else:
-            self._hand_over()
-            action, _ = self.policy.predict(self._last_obs, group=self._env_groups)
+            lengths = [mode.mean_length for mode in self._modes if mode.n_trajectories]
+            if lengths:
+                # On average after the time that a mode needs for all of its way
+                self._behavior.hand_over(len(self._modes), 1 / float(np.mean(lengths)))
+            action, _ = self.policy.predict(self._last_obs, group=self._behavior.groups)
             scaled_action = self.policy.scale_action(action)
             if action_noise is not None:
                 scaled_action = np.clip(scaled_action + action_noise().reshape(shape), -1.0, 1.0)
         return self.policy.unscale_action(scaled_action), scaled_action
 
-    def _draw_group(self) -> int:
-        """What drives an environment through its next episode: exploration, or the modes and the zero embedding in turn."""
-        # The random actions of the warm-up are no mode's doing
-        warming_up = self.num_timesteps < self.learning_starts
-        if not self._modes or warming_up or np.random.rand() < self._exploration_share():
-            return EXPLORATORY_GROUP
-        return self._next_in_turn()
-
-    def _next_in_turn(self) -> int:
-        self._rotation += 1
-        turn = self._rotation % (len(self._modes) + 1)
-        return UNCONDITIONED if turn == 0 else turn
-
-    def _hand_over(self) -> None:
-        """End the exploring part of some episodes: at every step with probability one by the modes' mean length."""
-        lengths = [mode.mean_length for mode in self._modes if mode.n_trajectories]
-        if not lengths:
-            return
-        leaves = self._env_may_leave & (np.random.rand(self.n_envs) < 1 / np.mean(lengths))
-        for env in np.flatnonzero(leaves & (self._env_groups == EXPLORATORY_GROUP)):
-            self._env_groups[env] = self._next_in_turn()
-            self._env_handed_over[env] = True
-
     def _exploration_share(self) -> float:
+        if self.num_timesteps < self.learning_starts:
+            return 1.0  # random actions are no mode's doing
         progress_remaining = self._current_progress_remaining
         if self.exploration_share is None:
             return 1 / (len(self._modes) + 1) if 1 - progress_remaining < self.exploration_fraction else 0.0
@@ -619,14 +594,12 @@ class DDiffPG(OffPolicyAlgorithm):
         positions = th.as_tensor(replay_buffer.last_positions(), device=self.device)
         self.novelty_model.observe(positions)
         for env, trajectory in replay_buffer.just_finished:
-            group = int(self._env_groups[env])
-            if group > EXPLORATORY_GROUP and not self._env_handed_over[env]:
-                trajectory.commanded = self._modes[group - 1].name
-                self._modes[group - 1].outcomes.append(trajectory.success)
+            mode = self._behavior.commanded_mode(env)
+            if mode is not None:
+                trajectory.commanded = self._modes[mode].name
+                self._modes[mode].outcomes.append(trajectory.success)
             self._warn_outside_support(trajectory)
-            self._env_groups[env] = self._draw_group()
-            self._env_handed_over[env] = False
-            self._env_may_leave[env] = np.random.rand() < self.explore_then_exploit
+            self._behavior.begin(env, len(self._modes), self._exploration_share(), self.explore_then_exploit)
 
     def _warn_outside_support(self, trajectory: Trajectory) -> None:
         """Once: values that the critics cannot represent make all actions look alike."""
@@ -681,9 +654,7 @@ class DDiffPG(OffPolicyAlgorithm):
         # What an earlier run left behind would end the exploration of this one's first episodes
         self._update_current_progress_remaining(self.num_timesteps, max(total_timesteps, 1))
         if new_episodes:
-            self._env_groups = np.array([self._draw_group() for _ in range(self.n_envs)], dtype=np.int64)
-            self._env_handed_over = np.zeros(self.n_envs, dtype=bool)
-            self._env_may_leave = np.random.rand(self.n_envs) < self.explore_then_exploit
+            self._behavior.begin_all(self.n_envs, len(self._modes), self._exploration_share(), self.explore_then_exploit)
         return total_timesteps, callback
 
     def _check_buffer(self, env: VecEnv) -> None:
@@ -749,11 +720,12 @@ class DDiffPG(OffPolicyAlgorithm):
         super().set_parameters(params, exact_match, device)
 
     def _expect_unknown_modes(self, n_modes: int) -> None:
+        known = len(self._modes)
         self.policy.resize(n_modes)
         first = self._next_mode_number
         self._modes = [Mode(name=f"mode_{first + index}", born_at=self.num_timesteps) for index in range(n_modes)]
         self._next_mode_number += n_modes
-        self._env_groups[self._env_groups > EXPLORATORY_GROUP] = UNCONDITIONED
+        self._behavior.follow([None] * known)
         self.replay_buffer.expect_modes(n_modes)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:

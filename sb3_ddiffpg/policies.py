@@ -11,13 +11,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Combine
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, UNCONDITIONED
 from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.diffusion import Denoiser, DiffusionModel
 from sb3_ddiffpg.features import ScaledFlattenExtractor
-
-# Rows of the embedding table: 0 explores, m + 1 is mode m. No row: the zero embedding.
-EXPLORATORY_GROUP = 0
-UNCONDITIONED = -1
 
 
 class DiffusionActor(BasePolicy):

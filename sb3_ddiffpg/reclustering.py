@@ -135,9 +135,7 @@ def _defend(
     return labels
 
 
-def _foreign(
-    told: dict[str, int], successes: list[Trajectory], labels: np.ndarray, established: set[int]
-) -> dict[int, int]:
+def _foreign(told: dict[str, int], successes: list[Trajectory], labels: np.ndarray, established: set[int]) -> dict[int, int]:
     """
     The new trajectories that were told to follow one mode, but took the route of another: their index, and the mode that
     they were told to follow. Seen as successes they would tell its critic that any route will do, and the policy of a

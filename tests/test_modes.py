@@ -13,7 +13,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import Mode, ModeTable
-from sb3_ddiffpg.policies import EXPLORATORY_GROUP, UNCONDITIONED
+from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, UNCONDITIONED, Behavior
 
 # Three ways of the same length to three places
 ROUTES = {"up": [(0, 0), (0, 6), (6, 6)], "down": [(0, 0), (0, -6), (6, -6)], "right": [(0, 0), (12, 0)]}
@@ -324,15 +324,16 @@ def test_target_actions_follow_their_lineage(two_routes):
 def test_environments_follow_names_not_numbers(two_routes):
     model = two_routes
     indices = {mode.name: index for index, mode in enumerate(model.modes)}
-    model._env_groups = np.array([indices["mode_0"] + 1, indices["mode_1"] + 1, EXPLORATORY_GROUP, UNCONDITIONED])
+    groups = [indices["mode_0"] + 1, indices["mode_1"] + 1, EXPLORATORY_GROUP, UNCONDITIONED]
+    model._behavior.groups = np.array(groups)
     walk(model, "right", 9)
     model.recluster()
     indices = {mode.name: index for index, mode in enumerate(model.modes)}
     assert indices == {"mode_2": 0, "mode_0": 1, "mode_1": 2}
-    assert model._env_groups.tolist() == [2, 3, EXPLORATORY_GROUP, UNCONDITIONED]
+    assert model._behavior.groups.tolist() == [2, 3, EXPLORATORY_GROUP, UNCONDITIONED]
     model.min_mode_size = 5
     assert model.recluster() == ["mode_1 retired"]
-    assert model._env_groups.tolist() == [2, UNCONDITIONED, EXPLORATORY_GROUP, UNCONDITIONED]
+    assert model._behavior.groups.tolist() == [2, UNCONDITIONED, EXPLORATORY_GROUP, UNCONDITIONED]
 
 
 def test_failures_go_to_the_nearest_mode(two_routes):
@@ -431,7 +432,7 @@ def test_rotation_and_exploration_share(two_routes):
 
     def shares(progress_remaining, n=3000):
         model._current_progress_remaining = progress_remaining
-        counts = Counter(model._draw_group() for _ in range(n))
+        counts = Counter(model._behavior.draw(len(model._modes), model._exploration_share()) for _ in range(n))
         exploring = counts.pop(EXPLORATORY_GROUP, 0)
         if counts:
             # The modes and the zero embedding take turns
@@ -449,20 +450,27 @@ def test_rotation_and_exploration_share(two_routes):
     assert shares(0.0) == 1.0  # nothing but exploration is left
 
 
-def test_exploring_episodes_hand_over(two_routes):
-    model = two_routes
+@pytest.mark.parametrize("may_hand_over", [False, True])
+def test_exploring_episodes_hand_over(may_hand_over):
     np.random.seed(0)
+    behavior = Behavior(6000)
+    behavior.groups = np.repeat([EXPLORATORY_GROUP, 1], 3000)
+    behavior.may_hand_over[:] = may_hand_over
+    behavior.hand_over(n_modes=2, probability=0.2)
+    left = behavior.groups[:3000] != EXPLORATORY_GROUP
+    np.testing.assert_array_equal(behavior.handed_over[:3000], left)
+    assert (behavior.groups[3000:] == 1).all() and not behavior.handed_over[3000:].any()
+    assert left.mean() == pytest.approx(0.2 * may_hand_over, abs=0.02)
+    # Nobody commanded these from their beginning
+    assert {behavior.commanded_mode(env) for env in range(3000)} == {None} and behavior.commanded_mode(3000) == 0
+
+
+def test_exploring_episodes_take_as_long_as_a_mode(two_routes):
+    model, asked = two_routes, []
+    model._behavior.hand_over = lambda n_modes, probability: asked.append((n_modes, probability))
+    model._sample_action(learning_starts=0)
     mean_length = np.mean([mode.mean_length for mode in model.modes])
-    model.n_envs = 6000
-    for may_leave in (False, True):
-        model._env_may_leave = np.full(6000, may_leave)
-        model._env_groups = np.repeat([EXPLORATORY_GROUP, 1], 3000)
-        model._env_handed_over = np.zeros(6000, dtype=bool)
-        model._hand_over()
-        left = model._env_groups[:3000] != EXPLORATORY_GROUP
-        np.testing.assert_array_equal(model._env_handed_over[:3000], left)
-        assert (model._env_groups[3000:] == 1).all() and not model._env_handed_over[3000:].any()
-        assert left.mean() == pytest.approx(may_leave / mean_length, abs=0.02)
+    assert asked == [(2, pytest.approx(1 / mean_length))]
 
 
 @pytest.mark.parametrize("explore_then_exploit", [0.0, 0.5, 1.0])
@@ -476,8 +484,8 @@ def test_success_rates_are_those_of_commanded_episodes(explore_then_exploit):
         names = {index + 1: mode.name for index, mode in enumerate(model.modes)}
         warm_up = model.num_timesteps - 3 < model.learning_starts
         for env in range(3):
-            group = int(model._env_groups[env])
-            began_exploring = warm_up or model._env_handed_over[env]
+            group = int(model._behavior.groups[env])
+            began_exploring = warm_up or model._behavior.handed_over[env]
             followed[env].append("nobody" if began_exploring else names.get(group, group))
             if local_variables["dones"][env]:
                 if len(set(followed[env])) == 1 and followed[env][0] in names.values():
@@ -504,6 +512,6 @@ def test_a_second_run_explores_again():
         DummyVecEnv([TwoEnds] * 8), learning_starts=0, exploration_share=lambda remaining: float(remaining > 0.5)
     )
     model.learn(400)
-    assert len(model.modes) >= 1 and (model._env_groups != EXPLORATORY_GROUP).all()
+    assert len(model.modes) >= 1 and (model._behavior.groups != EXPLORATORY_GROUP).all()
     model._setup_learn(400)
-    assert (model._env_groups == EXPLORATORY_GROUP).all()
+    assert (model._behavior.groups == EXPLORATORY_GROUP).all()

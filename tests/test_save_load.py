@@ -121,8 +121,10 @@ def test_zip_holds_everything_that_was_learned(novelty, tmp_path):
         )
         np.testing.assert_array_equal(ours.representative, theirs.representative)
         np.testing.assert_array_equal(ours.embedding, theirs.embedding)
-    attributes = ("num_timesteps", "n_rollouts", "_n_updates", "_next_mode_number", "_rotation", "_episode_num")
+    attributes = ("num_timesteps", "n_rollouts", "_n_updates", "_next_mode_number", "_episode_num")
     assert [getattr(loaded, name) for name in attributes] == [getattr(model, name) for name in attributes]
+    assert loaded._behavior.n_turns == model._behavior.n_turns > 0
+    np.testing.assert_array_equal(loaded._behavior.groups, model._behavior.groups)
 
 
 def test_zip_is_small(trained, tmp_path):

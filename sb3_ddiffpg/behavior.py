@@ -1,0 +1,92 @@
+"""What drives each environment through its episode: exploration, a mode, or the zero embedding."""
+
+import numpy as np
+
+# Rows of the policy's embedding table: 0 explores, m + 1 is mode m. No row: the zero embedding.
+EXPLORATORY_GROUP = 0
+UNCONDITIONED = -1
+
+
+class Behavior:
+    """
+    The group that drives each environment. It is drawn at an episode's beginning and kept through it: redrawn at every step
+    it would mix several in one trajectory. Only an exploring episode may hand over, once, to a mode or the zero embedding.
+
+    :param n_envs: Number of environments
+    """
+
+    def __init__(self, n_envs: int) -> None:
+        self.groups = np.zeros(n_envs, dtype=np.int64)
+        self.handed_over = np.zeros(n_envs, dtype=bool)
+        self.may_hand_over = np.zeros(n_envs, dtype=bool)
+        self.n_turns = 0
+
+    def begin_all(self, n_envs: int, n_modes: int, exploration_share: float, explore_then_exploit: float) -> None:
+        """
+        New episodes everywhere.
+
+        :param n_envs: Number of environments
+        :param n_modes: Number of modes M
+        :param exploration_share: Probability that an episode explores
+        :param explore_then_exploit: Probability that an exploring episode may hand over
+        """
+        self.groups = np.array([self.draw(n_modes, exploration_share) for _ in range(n_envs)], dtype=np.int64)
+        self.handed_over = np.zeros(n_envs, dtype=bool)
+        self.may_hand_over = np.random.rand(n_envs) < explore_then_exploit
+
+    def begin(self, env: int, n_modes: int, exploration_share: float, explore_then_exploit: float) -> None:
+        """
+        A new episode in one environment.
+
+        :param env: Index of the environment
+        :param n_modes: Number of modes M
+        :param exploration_share: Probability that the episode explores
+        :param explore_then_exploit: Probability that it may hand over if it explores
+        """
+        self.groups[env] = self.draw(n_modes, exploration_share)
+        self.handed_over[env] = False
+        self.may_hand_over[env] = np.random.rand() < explore_then_exploit
+
+    def draw(self, n_modes: int, exploration_share: float) -> int:
+        """
+        :param n_modes: Number of modes M
+        :param exploration_share: Probability of exploring; 1 also while there is no mode
+        :return: The exploratory group, or in turn a mode's or none
+        """
+        if not n_modes or np.random.rand() < exploration_share:
+            return EXPLORATORY_GROUP
+        return self._next_in_turn(n_modes)
+
+    def _next_in_turn(self, n_modes: int) -> int:
+        self.n_turns += 1
+        turn = self.n_turns % (n_modes + 1)
+        return UNCONDITIONED if turn == 0 else turn
+
+    def hand_over(self, n_modes: int, probability: float) -> None:
+        """
+        End the exploring part of some episodes.
+
+        :param n_modes: Number of modes M
+        :param probability: Of each episode that may hand over
+        """
+        leaves = self.may_hand_over & (np.random.rand(len(self.groups)) < probability)
+        for env in np.flatnonzero(leaves & (self.groups == EXPLORATORY_GROUP)):
+            self.groups[env] = self._next_in_turn(n_modes)
+            self.handed_over[env] = True
+
+    def commanded_mode(self, env: int) -> int | None:
+        """
+        :param env: Index of the environment
+        :return: The mode that has driven its episode from the beginning, None if none has
+        """
+        group = int(self.groups[env])
+        return group - 1 if group > EXPLORATORY_GROUP and not self.handed_over[env] else None
+
+    def follow(self, new_modes: list[int | None]) -> None:
+        """
+        After a re-clustering the environments go on with the mode they follow, whatever its index is now.
+
+        :param new_modes: New index of every old mode, None if it is gone
+        """
+        groups = {old + 1: UNCONDITIONED if new is None else new + 1 for old, new in enumerate(new_modes)}
+        self.groups = np.array([groups.get(group, group) for group in self.groups.tolist()], dtype=np.int64)
