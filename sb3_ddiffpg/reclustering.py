@@ -164,14 +164,14 @@ def _old_labels(
     dormant: list[int],
     rng: np.random.RandomState,
 ) -> np.ndarray:
-    """Mode of every success so far. New ones are lent to the nearest dormant mode, so that it may find itself again."""
+    """Mode of every success so far. New ones nearest to a dormant mode are lent to it, so that it may find itself again."""
     labels = np.array([trajectory.mode for trajectory in successes], dtype=int)
     unowned = np.flatnonzero(labels == NO_MODE)
-    dormant = [mode for mode in dormant if len(modes[mode].representative)]
-    if dormant and len(unowned):
-        members = [[buffer.resample(modes[mode].representative)] for mode in dormant]
+    known = [mode for mode in range(len(modes)) if len(modes[mode].representative)]
+    if len(unowned) and set(dormant) & set(known):
+        members = [[buffer.resample(modes[mode].representative)] for mode in known]
         nearest = assign_to_nearest([buffer.path(successes[i]) for i in unowned], members, rng, n_samples=1)
-        labels[unowned] = np.asarray(dormant)[nearest]
+        labels[unowned] = [mode if mode in dormant else NO_MODE for mode in np.asarray(known)[nearest].tolist()]
     return labels
 
 

@@ -423,6 +423,24 @@ def test_a_route_that_was_found_against_orders_is_a_mode(two_routes):
     assert [trajectory for trajectory in buffer.trajectories(False) if trajectory.foreign] == [strayed]
 
 
+def test_what_a_dormant_mode_finds_is_its_own(two_routes):
+    """As after loading a model without its buffer; "up" has been found again, "down" not yet."""
+    model = two_routes
+    model.replay_buffer.reset()
+    model.replay_buffer.expect_modes(2)
+    walk(model, "up", 4)
+    assert model.recluster() == [] and {mode.name: route_of(mode) for mode in model.modes} == {
+        "mode_0": "down",
+        "mode_1": "up",
+    }
+    walk(model, "up", 6)
+    assert model.recluster() == [] and model.modes["mode_1"].n_trajectories == 10
+    walk(model, "down", 3)
+    assert model.recluster() == []
+    assert {mode.name: mode.n_trajectories for mode in model.modes} == {"mode_0": 3, "mode_1": 10}
+    assert {mode.name: route_of(mode) for mode in model.modes} == {"mode_0": "down", "mode_1": "up"}
+
+
 # ---------------------------------------------------------------------- who drives which episode
 
 
