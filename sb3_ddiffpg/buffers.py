@@ -1,5 +1,6 @@
 """Replay buffer that knows modes, and stores target actions beside every action."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -221,6 +222,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         failures: list[Trajectory],
         failure_modes: np.ndarray,
         parents: list[int | None],
+        abandoned: Sequence[Trajectory] = (),
     ) -> None:
         """
         Hand the trajectories to their new modes and rebuild the modes' rows. Each mode learns from its newest direct successes
@@ -232,11 +234,12 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param failure_modes: New mode of each
         :param parents: For every new mode, the old mode from which it inherits. A trajectory that comes from another lineage
             starts again with its action as target action
+        :param abandoned: Further goal-reached trajectories, which retire to exploration
         """
         self._groups, self._group_rows = {}, {}
         self.mode_rows = [RowSet(self._mode_position) for _ in parents]
         stays: list[Trajectory] = []
-        goes: list[Trajectory] = []
+        goes: list[Trajectory] = list(abandoned)
         for trajectories, modes, limit in (
             (successes, success_modes, self.max_successes_per_mode),
             (failures, failure_modes, self.max_failures_per_mode),
@@ -259,7 +262,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             if trajectory.trains:
                 self.mode_rows[trajectory.mode].add(trajectory.rows)
         for trajectory in sorted(goes, key=lambda t: t.serial):
-            trajectory.mode, trajectory.path = NO_MODE, None
+            trajectory.mode, trajectory.trains, trajectory.path = NO_MODE, False, None
             self._retired.append(trajectory)
 
     def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:

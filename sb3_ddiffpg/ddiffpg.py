@@ -83,7 +83,8 @@ class DDiffPG(OffPolicyAlgorithm):
     :param linkage: Linkage of the hierarchical clustering, as in ``scipy.cluster.hierarchy.linkage``
     :param max_modes: Most modes at a time; 1 turns clustering off
     :param min_mode_size: Fewest goal-reached trajectories that make a mode
-    :param mode_patience: Re-clusterings in a row that must find no cluster for a mode before it is merged or retired
+    :param mode_patience: Re-clusterings in a row that must find a mode within another before it is merged
+    :param mode_trials: Commanded training episodes in a row that must miss a mode's route before it is retired
     :param max_successes_per_mode: Newest goal-reached trajectories that train a mode
     :param max_failures_per_mode: Newest failed trajectories that train a mode
     :param mode_embedding_dim: Size of a mode embedding
@@ -93,7 +94,8 @@ class DDiffPG(OffPolicyAlgorithm):
         else the whole observation, standardised
     :param success_key: Key of ``info`` that marks a success, see ``ModeReplayBuffer``
     :param exploration_share: Share of episodes that explore, a float or a function of the remaining progress. None:
-        ``1 / (M + 1)`` until ``exploration_fraction`` of the training, then 0; always 1 while there is no mode
+        ``1 / (M + 1)`` until ``exploration_fraction`` of the training, then 0; always 1 while there is no mode. While it is
+        0, no further mode is born
     :param exploration_fraction: Part of the training that explores, when ``exploration_share`` is None
     :param explore_then_exploit: Share of the exploring episodes that hand over to a mode or the zero embedding after a random
         time (on average the modes' mean length), so that they come to a goal by a way that no mode would have taken
@@ -164,6 +166,7 @@ class DDiffPG(OffPolicyAlgorithm):
         max_modes: int = 10,
         min_mode_size: int = 5,
         mode_patience: int = 10,
+        mode_trials: int = 200,
         max_successes_per_mode: int = 40,
         max_failures_per_mode: int = 20,
         mode_embedding_dim: int = 5,
@@ -237,6 +240,7 @@ class DDiffPG(OffPolicyAlgorithm):
         self.max_modes = max_modes
         self.min_mode_size = min_mode_size
         self.mode_patience = mode_patience
+        self.mode_trials = mode_trials
         self.max_successes_per_mode = max_successes_per_mode
         self.max_failures_per_mode = max_failures_per_mode
         self.mode_embedding_dim = mode_embedding_dim
@@ -505,12 +509,21 @@ class DDiffPG(OffPolicyAlgorithm):
         """
         started = time.perf_counter()
         found = find_modes(
-            self.replay_buffer, self._modes, self._cluster, self.min_mode_size, self.max_modes, self.mode_patience
+            self.replay_buffer,
+            self._modes,
+            self._cluster,
+            self.min_mode_size,
+            self.max_modes,
+            self.mode_patience,
+            self.mode_trials,
+            births=self._exploration_share() > 0,
         )
         if found is None:
             return []
         parents, kept = found.inheritance.parents, found.inheritance.kept
-        self.replay_buffer.assign_modes(found.successes, found.labels, found.failures, found.failure_labels, parents)
+        self.replay_buffer.assign_modes(
+            found.successes, found.labels, found.failures, found.failure_labels, parents, found.abandoned
+        )
         self.policy.inherit(parents, kept, self.reset_new_critics)
         old_names = [mode.name for mode in self._modes]
         self._modes, events, self._next_mode_number = succeed(
@@ -598,6 +611,7 @@ class DDiffPG(OffPolicyAlgorithm):
             if mode is not None:
                 trajectory.commanded = self._modes[mode].name
                 self._modes[mode].outcomes.append(trajectory.success)
+                self._modes[mode].misses += 1  # until the next clustering tells which route it took
             self._warn_outside_support(trajectory)
             self._behavior.begin(env, len(self._modes), self._exploration_share(), self.explore_then_exploit)
 

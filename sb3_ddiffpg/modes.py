@@ -21,7 +21,8 @@ class Mode:
     :param mean_return: Their mean undiscounted return
     :param representative: Mode features along the most central of them (the medoid), shape [length + 1, dim]
     :param outcomes: Success of the latest training episodes that were commanded to this mode
-    :param doubts: Re-clusterings in a row that found no cluster for it
+    :param doubts: Re-clusterings in a row that found it within another mode's cluster
+    :param misses: Training episodes in a row that were commanded to it and did not reach the goal by its route
     :param embedding: The vector that commands it; filled in by ``model.modes``, owned by the policy
     """
 
@@ -33,6 +34,7 @@ class Mode:
     representative: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32), repr=False)
     outcomes: deque[bool] = field(default_factory=lambda: deque(maxlen=100), repr=False)
     doubts: int = field(default=0, repr=False)
+    misses: int = field(default=0, repr=False)
     embedding: np.ndarray | None = field(default=None, repr=False)
 
     @property

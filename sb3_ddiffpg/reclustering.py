@@ -21,6 +21,7 @@ class Reclustering:
     :param distances: Their DTW distances, shape [N, N]
     :param failures: The failed trajectories
     :param failure_labels: New mode of each
+    :param abandoned: Goal-reached trajectories of modes that were given up
     :param inheritance: Which new mode follows which old one
     """
 
@@ -29,6 +30,7 @@ class Reclustering:
     distances: np.ndarray
     failures: list[Trajectory]
     failure_labels: np.ndarray
+    abandoned: list[Trajectory]
     inheritance: Inheritance
 
     def describe(self, modes: Sequence[Mode], buffer: ModeReplayBuffer) -> None:
@@ -56,6 +58,8 @@ def find_modes(
     min_size: int,
     max_modes: int,
     patience: int,
+    trials: int,
+    births: bool,
 ) -> Reclustering | None:
     """
     :param buffer: Holds the trajectories
@@ -63,10 +67,15 @@ def find_modes(
     :param cluster: Maps distances [N, N] to labels [N]
     :param min_size: Fewest goal-reached trajectories worth clustering
     :param max_modes: Most modes at a time
-    :param patience: Re-clusterings in a row that must find no cluster for a mode before it ends
+    :param patience: Re-clusterings in a row that must find a mode within another before it is merged
+    :param trials: Commanded episodes in a row that must miss a mode's route before it is given up
+    :param births: Whether modes may be born; the first always may
     :return: The new modes, or None when nothing could take the place of the old ones
     """
-    successes, failures = buffer.trajectories(success=True), buffer.trajectories(success=False)
+    given_up = _given_up(modes, trials) if buffer.has_success_signal else []
+    found, failures = buffer.trajectories(success=True), buffer.trajectories(success=False)
+    abandoned = [trajectory for trajectory in found if trajectory.mode in given_up]
+    successes = [trajectory for trajectory in found if trajectory.mode not in given_up]
     distances = np.zeros((len(successes), len(successes)), dtype=np.float32)
     labels = np.full(len(successes), NO_MODE)
     if len(successes) >= min_size:
@@ -76,13 +85,18 @@ def find_modes(
     if n_new == 0 and modes:
         return None
     rng = np.random.RandomState(np.random.randint(2**31))
-    dormant = _dormant(successes, len(modes))
+    dormant = _dormant(found, len(modes))
     old_labels = _old_labels(buffer, successes, modes, dormant, rng)
     labels = _defend(modes, distances, old_labels, labels, patience, max_modes)
+    if modes and not births:
+        labels = _without_births(old_labels, labels, len(modes))
     n_new = int(labels.max(initial=NO_MODE)) + 1
     inheritance = _with_dormant(match_modes(old_labels, labels, len(modes), n_new), dormant, max_modes)
     heirs = {parent: new for new, parent in enumerate(inheritance.parents) if inheritance.kept[new] and parent is not None}
     told = {mode.name: heirs[old] for old, mode in enumerate(modes) if old in heirs}
+    for trajectory, label in zip(successes, labels.tolist(), strict=True):
+        if trajectory.mode == NO_MODE and label != NO_MODE and told.get(trajectory.commanded or "") == label:
+            modes[inheritance.parents[label]].misses = 0
     failure_labels = np.array([told.get(failure.commanded or "", NO_MODE) for failure in failures], dtype=int)
     # A mode must see its own failures; those that nobody told where to go are shared out by likeness, as in the paper
     strayed = np.flatnonzero([failure.commanded is None for failure in failures])
@@ -98,7 +112,7 @@ def find_modes(
         own = np.array([i not in foreign for i in range(len(successes))], dtype=bool)
         successes = [trajectory for trajectory, is_own in zip(successes, own, strict=True) if is_own]
         labels, distances = labels[own], distances[np.ix_(own, own)]
-    return Reclustering(successes, labels, distances, failures, failure_labels, inheritance)
+    return Reclustering(successes, labels, distances, failures, failure_labels, abandoned, inheritance)
 
 
 def _defend(
@@ -110,8 +124,9 @@ def _defend(
     max_modes: int,
 ) -> np.ndarray:
     """
-    Labels in which a mode that was found no cluster keeps its members for a while. Near the border between one cluster and
-    two the answer changes with every new trajectory, and a mode that ends takes its critics with it.
+    Labels in which a mode that was found no cluster of its own keeps its members: for a while if they lie within another
+    mode's cluster, until it is given up if they lie in none. Near the border between one cluster and two, or none, the
+    answer changes with every new trajectory, and a mode that ends takes its critics with it.
 
     A new trajectory in a cluster of which a part is defended goes to the mode of its nearest old one.
     """
@@ -120,10 +135,11 @@ def _defend(
     labels = labels.copy()
     for old in sorted([*inheritance.merged, *inheritance.retired]):
         members = np.flatnonzero(old_labels == old)
-        modes[old].doubts += 1
+        within_another = old in inheritance.merged
+        modes[old].doubts += within_another
         if modes[old].doubts > patience or n_new >= max_modes or not len(members):
             continue
-        if old in inheritance.merged:
+        if within_another:
             host = labels == inheritance.merged[old]
             settled, newcomers = np.flatnonzero(host & (old_labels != NO_MODE)), np.flatnonzero(host & (old_labels == NO_MODE))
             nearest = settled[distances[np.ix_(newcomers, settled)].argmin(axis=1)]
@@ -132,6 +148,26 @@ def _defend(
         n_new += 1
     for old in set(range(len(modes))) - set(inheritance.merged) - set(inheritance.retired):
         modes[old].doubts = 0
+    return labels
+
+
+def _given_up(modes: Sequence[Mode], trials: int) -> list[int]:
+    """Modes that cannot be commanded: a clump of wanderings, or a copy of another mode. Unless that is true of all."""
+    missing = [index for index, mode in enumerate(modes) if mode.misses >= trials]
+    return missing if len(missing) < len(modes) else []
+
+
+def _without_births(old_labels: np.ndarray, labels: np.ndarray, n_old: int) -> np.ndarray:
+    """
+    Labels without clusters that continue no mode: a part of a mode goes back to it, the rest are outliers. A mode that is
+    born when exploration is over would have too little time to learn.
+    """
+    n_new = int(labels.max(initial=NO_MODE)) + 1
+    inheritance = match_modes(old_labels, labels, n_old, n_new)
+    heirs = {parent: new for new, parent in enumerate(inheritance.parents) if inheritance.kept[new]}
+    goes_to = np.array([heirs.get(parent, NO_MODE) for parent in inheritance.parents] + [NO_MODE])  # the last for NO_MODE
+    labels = goes_to[labels]
+    labels[labels != NO_MODE] = np.unique(labels[labels != NO_MODE], return_inverse=True)[1]
     return labels
 
 

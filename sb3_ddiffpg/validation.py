@@ -33,7 +33,7 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
         (
             *("n_diffusion_steps", "n_action_gradient_steps", "n_critics", "n_atoms", "mode_n_steps", "exploration_n_steps"),
             *("recluster_freq", "max_modes", "min_mode_size", "max_successes_per_mode", "max_failures_per_mode"),
-            *("mode_embedding_dim", "batch_size", "buffer_size"),
+            *("mode_embedding_dim", "mode_trials", "batch_size", "buffer_size"),
         ),
         "be an integer of at least 1",
         lambda value: _is_integer(value) and value >= 1,

@@ -19,6 +19,7 @@ SMALL: dict[str, Any] = {
     "train_freq": 4,
     "recluster_freq": 5,
     "distance_threshold": 0.5,
+    "exploration_fraction": 1.0,
     "seed": 0,
     "policy_kwargs": {"net_arch": [16]},
 }

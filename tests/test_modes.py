@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import Mode, ModeTable
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, UNCONDITIONED, Behavior
+from sb3_ddiffpg.trajectories import NO_MODE
 
 # Three ways of the same length to three places
 ROUTES = {"up": [(0, 0), (0, 6), (6, 6)], "down": [(0, 0), (0, -6), (6, -6)], "right": [(0, 0), (12, 0)]}
@@ -271,12 +272,65 @@ def test_a_retirement(two_routes):
     model = two_routes
     walk(model, "right", 9)
     model.recluster()
-    model.min_mode_size = 5
-    assert model.recluster() == ["mode_1 retired"]  # four trajectories
+    # Nobody reaches the goal by its route any more, whatever the command
+    model.modes["mode_1"].misses = model.mode_trials
+    assert model.recluster() == ["mode_1 retired"]
     assert [(mode.name, route_of(mode)) for mode in model.modes] == [("mode_2", "right"), ("mode_0", "down")]
+    assert all(trajectory.mode != NO_MODE for trajectory in model.replay_buffer.trajectories(True))
+    assert model.replay_buffer.size() == (4 + 5 + 9) * 12  # what it leaves still serves exploration
     # It may come back, under a new name
-    walk(model, "up", 1)
+    walk(model, "up", 4)
     assert model.recluster() == ["mode_3 born"]
+
+
+def test_misses_are_counted_until_the_route_is_taken(two_routes):
+    model, buffer = two_routes, two_routes.replay_buffer
+    mode = model.modes["mode_1"]
+    mode.misses = 7
+    for route, commanded, success in (("up", None, True), ("down", "mode_1", True), ("up", "mode_1", False)):
+        walk(model, route, 1, success)
+        buffer.trajectories(success)[-1].commanded = commanded
+        assert model.recluster() == [] and mode.misses == 7
+    walk(model, "up", 1)
+    buffer.trajectories(True)[-1].commanded = "mode_1"
+    assert model.recluster() == [] and mode.misses == 0
+
+
+def test_the_last_modes_are_not_given_up(two_routes):
+    """When none can be commanded, the policy is at fault."""
+    for mode in two_routes.modes:
+        mode.misses = 10_000
+    assert two_routes.recluster() == [] and two_routes.modes.names == ["mode_0", "mode_1"]
+
+
+def test_a_mode_without_a_cluster_goes_on(two_routes):
+    model = two_routes
+    before = belongings(model)
+    model.min_mode_size = 5  # it has four
+    for _ in range(20):
+        assert model.recluster() == []
+    assert same(belongings(model)["mode_1"], before["mode_1"])
+
+
+def test_no_mode_is_born_when_exploration_is_over(two_routes):
+    model = two_routes
+    model.exploration_share = 0.0
+    model.num_timesteps = model.learning_starts
+    walk(model, "right", 4)
+    assert model.recluster() == [] and model.modes.names == ["mode_0", "mode_1"]
+    assert sum(trajectory.mode == NO_MODE for trajectory in model.replay_buffer.trajectories(True)) == 4
+    # A part that would split off stays where it was
+    model.distance_threshold = 100.0
+    assert model.recluster() == ["mode_1 merged into mode_0"]
+    model.distance_threshold = 2.0
+    assert model.recluster() == [] and model.modes["mode_0"].n_trajectories == 4 + 5 + 4
+    model.exploration_share = 0.1
+    assert model.recluster() == ["mode_2 split from mode_0", "mode_3 split from mode_0"]
+    # The first mode is always welcome
+    model = planar_model(exploration_share=0.0)
+    model.num_timesteps = model.learning_starts
+    walk(model, "up", 4)
+    assert model.recluster() == ["mode_0 born"]
 
 
 def test_patience_outlasts_a_doubt(two_routes):
@@ -331,7 +385,7 @@ def test_environments_follow_names_not_numbers(two_routes):
     indices = {mode.name: index for index, mode in enumerate(model.modes)}
     assert indices == {"mode_2": 0, "mode_0": 1, "mode_1": 2}
     assert model._behavior.groups.tolist() == [2, 3, EXPLORATORY_GROUP, UNCONDITIONED]
-    model.min_mode_size = 5
+    model.modes["mode_1"].misses = model.mode_trials
     assert model.recluster() == ["mode_1 retired"]
     assert model._behavior.groups.tolist() == [2, UNCONDITIONED, EXPLORATORY_GROUP, UNCONDITIONED]
 
@@ -457,7 +511,7 @@ def test_rotation_and_exploration_share(two_routes):
             assert counts.keys() == {UNCONDITIONED, 1, 2} and max(counts.values()) - min(counts.values()) <= 1
         return exploring / n
 
-    model.num_timesteps = model.learning_starts
+    model.num_timesteps, model.exploration_fraction = model.learning_starts, 0.7
     assert shares(1.0) == pytest.approx(1 / 3, abs=0.04) and shares(0.31) == pytest.approx(1 / 3, abs=0.04)
     assert shares(0.29) == 0.0  # after exploration_fraction
     model.exploration_share = 0.6
