@@ -39,6 +39,12 @@ class ModeBatch(NamedTuple):
     windows: np.ndarray
 
 
+# What may be changed when a run goes on; n_path_points may not: stored paths have so many
+_MODE_SETTINGS = (
+    *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct", "loop_share", "route_share"),
+)
+
+
 class ModeReplayBuffer(TrajectoryReplayBuffer):
     """
     A ``TrajectoryReplayBuffer`` whose trajectories belong to modes. Each row has two target actions: one for the mode that
@@ -121,6 +127,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     def reset(self) -> None:
         """Forget everything and release the storage."""
         super().reset()
+        self.owner: tuple[str, list[str]] = ("", [])  # run and names of its modes, noted when it is saved
         self._feature_scale: np.ndarray | None = None
         self._distances = DistanceCache()
         self._mode_position = np.empty(0, dtype=np.int32)
@@ -167,6 +174,27 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         successes, failures = self.trajectories(success=True), self.trajectories(success=False)
         nobody = np.full(len(successes), NO_MODE), np.full(len(failures), NO_MODE)
         self.assign_modes(successes, nobody[0], failures, nobody[1], [None] * n_modes)
+
+    def renumber_modes(self, new_modes: list[int], n_modes: int) -> None:
+        """
+        Follow a model whose modes have other numbers.
+
+        :param new_modes: New index of every mode so far, ``NO_MODE`` if the model does not have it
+        :param n_modes: Number of modes of the model
+        """
+        successes, failures = self.trajectories(success=True), self.trajectories(success=False)
+        table = np.array([*new_modes, NO_MODE])  # the last one for NO_MODE itself
+        labels = [table[np.array([t.mode for t in part], dtype=int)] for part in (successes, failures)]
+        parents = [new_modes.index(mode) if mode in new_modes else None for mode in range(n_modes)]
+        self.assign_modes(successes, labels[0], failures, labels[1], parents)
+
+    def adopt_settings(self, other: "ModeReplayBuffer") -> None:
+        """
+        :param other: The buffer that this one, loaded from a file, takes the place of
+        """
+        for name in ("success_key", *_MODE_SETTINGS):
+            setattr(self, name, getattr(other, name))
+        self._success_rule.success_key = other.success_key
 
     def path(self, trajectory: Trajectory) -> np.ndarray:
         """

@@ -4,6 +4,7 @@ import contextlib
 import io
 import pathlib
 import time
+import uuid
 import warnings
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
@@ -26,13 +27,14 @@ from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.callbacks import ClusteringCallback
 from sb3_ddiffpg.clustering import cluster
 from sb3_ddiffpg.critics import ModeCritics
+from sb3_ddiffpg.features import declared_mode_features, same_selection
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, noveld_reward
 from sb3_ddiffpg.modes import Mode, ModeTable, succeed
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
 from sb3_ddiffpg.policies import DiffusionActor, DiffusionPolicy
 from sb3_ddiffpg.reclustering import find_modes
 from sb3_ddiffpg.target_actions import ascend
-from sb3_ddiffpg.trajectories import Trajectory
+from sb3_ddiffpg.trajectories import NO_MODE, Trajectory
 from sb3_ddiffpg.validation import check_arguments
 
 SelfDDiffPG = TypeVar("SelfDDiffPG", bound="DDiffPG")
@@ -261,6 +263,7 @@ class DDiffPG(OffPolicyAlgorithm):
 
         # What a run remembers beside its networks; all of it is saved
         self.n_rollouts = 0
+        self.run_id = uuid.uuid4().hex  # whose modes are meant: every run has a "mode_0"
         self._modes: list[Mode] = []
         self._next_mode_number = 0
         self._behavior = Behavior(0)
@@ -316,17 +319,13 @@ class DDiffPG(OffPolicyAlgorithm):
         self._create_aliases()
 
     def _resolve_mode_features(self) -> None:
+        before = self._resolved_features
         if self.mode_features is not None:
             self._resolved_features = self.mode_features
         elif self.env is not None:
-            # Asked first: a worker process would die of an attribute that its environment does not have
-            if self.env.has_attr("mode_features"):
-                self._resolved_features = self.env.get_attr("mode_features", indices=0)[0]
-            else:
-                is_goal_env = (
-                    isinstance(self.observation_space, spaces.Dict) and "achieved_goal" in self.observation_space.spaces
-                )
-                self._resolved_features = "achieved_goal" if is_goal_env else None
+            self._resolved_features = declared_mode_features(self.env)
+        if self._modes and not same_selection(before, self._resolved_features):
+            raise ValueError(f"mode_features={self._resolved_features}: the modes of this model were found in {before}")
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -571,6 +570,8 @@ class DDiffPG(OffPolicyAlgorithm):
         if mode is not None:
             table = ModeTable(self._modes)
             single = np.ndim(mode) == 0
+            if not single and len(mode) == 0:  # type: ignore[arg-type]
+                raise ValueError(f"mode={mode!r} is unknown: it names no mode")
             indices = table.index(mode) if single else np.array([table.index(each) for each in mode])  # type: ignore[arg-type, union-attr]
         return self.policy.predict(observation, state, episode_start, deterministic, mode=indices)
 
@@ -592,6 +593,7 @@ class DDiffPG(OffPolicyAlgorithm):
             scaled_action = self.policy.scale_action(action)
             if action_noise is not None:
                 scaled_action = np.clip(scaled_action + action_noise().reshape(shape), -1.0, 1.0)
+            self.replay_buffer.check_finite("policy's action (has training diverged?)", scaled_action)
         return self.policy.unscale_action(scaled_action), scaled_action
 
     def _exploration_share(self) -> float:
@@ -659,6 +661,11 @@ class DDiffPG(OffPolicyAlgorithm):
     ) -> tuple[int, BaseCallback]:
         assert self.env is not None, "You must set the environment before calling learn()"
         self._check_buffer(self.env)
+        if self._vec_normalize_env is not None and self._vec_normalize_env.norm_reward:
+            warnings.warn(
+                "VecNormalize scales the rewards (norm_reward=True), and so the values, which the critics' support "
+                f"[v_min={self.v_min}, v_max={self.v_max}] must cover; norm_reward=False leaves them in reward units"
+            )
         new_episodes = reset_num_timesteps or self._last_obs is None
         if new_episodes:
             self.replay_buffer.drop_unfinished_episodes()
@@ -728,9 +735,12 @@ class DDiffPG(OffPolicyAlgorithm):
         params: Any = load_path_or_dict
         if not isinstance(params, dict):
             _, params, _ = load_from_zip_file(params, device=device, load_data=False)
-        embeddings = params.get("policy", {}).get("mode_embeddings")
-        if embeddings is not None and len(embeddings) - 1 != len(self._modes):
-            self._expect_unknown_modes(len(embeddings) - 1)
+        policy = params.get("policy", {})
+        n_modes = len(policy["mode_embeddings"]) - 1 if "mode_embeddings" in policy else len(self._modes)
+        # What does not fit is refused by SB3; it must not cost the modes before that
+        complete = not exact_match or set(params) == set(self._get_torch_save_params()[0])
+        if n_modes != len(self._modes) and complete and self.policy.fits_but_for_modes(policy):
+            self._expect_unknown_modes(n_modes)
         super().set_parameters(params, exact_match, device)
 
     def _expect_unknown_modes(self, n_modes: int) -> None:
@@ -742,13 +752,24 @@ class DDiffPG(OffPolicyAlgorithm):
         self._behavior.follow([None] * known)
         self.replay_buffer.expect_modes(n_modes)
 
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Save the replay buffer with its trajectories, clusters, target actions and distances.
+
+        :param path: Path to the file
+        """
+        self.replay_buffer.owner = self.run_id, [mode.name for mode in self._modes]
+        super().save_replay_buffer(path)
+
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
-        Load a replay buffer with its trajectories, clusters, target actions and distances.
+        Load a replay buffer of this model's run, saved with it or at another time: trajectories follow the names of their
+        modes. Its settings stay those that the model was made with.
 
         :param path: Path to the pickled replay buffer
         :param truncate_last_traj: Whether the next ``learn`` resets the environments and drops the episodes in progress
-        :raises ValueError: If it is no ``ModeReplayBuffer``, or holds other modes than the model
+        :raises ValueError: If it is no ``ModeReplayBuffer``, was filled with other mode features, or is of another run and the
+            model has modes
         """
         previous = self.replay_buffer
         with contextlib.suppress(AssertionError):  # SB3's, for anything but a replay buffer
@@ -757,11 +778,18 @@ class DDiffPG(OffPolicyAlgorithm):
         problem = None
         if not isinstance(loaded, ModeReplayBuffer):
             problem = f"is a {type(loaded).__name__}, not a ModeReplayBuffer"
-        elif len(loaded.mode_rows) != len(self._modes):
-            problem = f"holds {len(loaded.mode_rows)} modes, the model {len(self._modes)}: save and load both together"
+        elif self._modes and loaded.owner[0] != self.run_id:
+            problem = "was not saved by this model: its modes are others"
+        elif previous is not None and not same_selection(loaded.features.selection, previous.features.selection):
+            problem = f"was filled with mode_features={loaded.features.selection}, not {previous.features.selection}"
         if problem is not None:
             self.replay_buffer = previous
             raise ValueError(f"The replay buffer {path} {problem}")
+        if previous is not None:
+            loaded.adopt_settings(previous)
+        names = [mode.name for mode in self._modes]
+        if loaded.owner[1] != names:
+            loaded.renumber_modes([names.index(name) if name in names else NO_MODE for name in loaded.owner[1]], len(names))
         if truncate_last_traj:
             self._last_obs = None
 

@@ -7,7 +7,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_ddiffpg.features import ModeFeatures
-from sb3_ddiffpg.trajectories import SUCCESS_KEYS
+from sb3_ddiffpg.trajectories import read_success
 
 
 @dataclass
@@ -15,14 +15,14 @@ class EpisodeResult:
     """
     One complete episode.
 
-    :param success: Whether the goal was reached
+    :param success: Whether the goal was reached, None if the environment does not say
     :param length: Number of steps
     :param episode_return: Sum of rewards
     :param label: Ground-truth mode, ``info["mode"]`` of the last step, None if the environment gives none
     :param path: Mode features along the episode, terminal state included, shape [length + 1, dim]
     """
 
-    success: bool
+    success: bool | None
     length: int
     episode_return: float
     label: str | None
@@ -42,7 +42,12 @@ def run_episodes(
     :param mode: Mode to command; None: the model draws one for each episode, if it has modes
     :param deterministic: Passed to ``predict``
     :return: ``n_episodes`` results, ordered by environment
+    :raises ValueError: If ``env`` is not vectorised or ``n_episodes`` no number of episodes
     """
+    if not isinstance(env, VecEnv):
+        raise ValueError(f"env must be a VecEnv, such as sb3_ddiffpg.envs.make_vec_env makes, got {env}")
+    if not isinstance(n_episodes, (int, np.integer)) or n_episodes < 1:
+        raise ValueError(f"n_episodes must be an integer of at least 1, got {n_episodes!r}")
     share = np.array([n_episodes // env.num_envs + (i < n_episodes % env.num_envs) for i in range(env.num_envs)])
     selection = getattr(model, "_resolved_features", None)
     if selection is None and env.has_attr("mode_features"):
@@ -65,12 +70,13 @@ def run_episodes(
             if not starts[i]:
                 paths[i].append(positions[i])
                 continue
-            terminal = infos[i].get("terminal_observation")
+            terminal: Any = infos[i].get("terminal_observation")
             if terminal is not None:
                 terminal = terminal if normalizer is None else normalizer.unnormalize_obs(terminal)
-                batch = {key: value[None] for key, value in terminal.items()} if isinstance(terminal, dict) else terminal[None]
+                is_dict = isinstance(terminal, dict)
+                batch = {key: value[None] for key, value in terminal.items()} if is_dict else np.asarray(terminal)[None]
                 paths[i].append(features(batch)[0])
-            success = next((bool(infos[i][key]) for key in SUCCESS_KEYS if key in infos[i]), False)
+            success = read_success(infos[i], getattr(model, "success_key", None))
             episode = EpisodeResult(success, len(paths[i]) - 1, float(returns[i]), infos[i].get("mode"), np.stack(paths[i]))
             results[i].append(episode)
             paths[i], returns[i] = [positions[i]], 0.0

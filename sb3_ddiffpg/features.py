@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 Observation = np.ndarray | dict[str, np.ndarray]
 
@@ -43,6 +44,42 @@ class ScaledFlattenExtractor(BaseFeaturesExtractor):
         :return: Shape [N, features_dim]
         """
         return (observations.flatten(1) - self.offset) * self.scale
+
+
+def declared_mode_features(env: VecEnv) -> Any:
+    """
+    What an environment itself says about its mode features, as found in the observations of the outermost wrapper.
+
+    :param env: The environments
+    :return: Their ``mode_features``, else ``"achieved_goal"`` of a goal environment, else None
+    :raises ValueError: If a wrapper has changed the observations so that the declared indices say nothing about them
+    """
+    # Asked first: a worker process would die of an attribute that its environment does not have
+    if not env.has_attr("mode_features"):
+        is_goal_env = isinstance(env.observation_space, spaces.Dict) and "achieved_goal" in env.observation_space.spaces
+        return "achieved_goal" if is_goal_env else None
+    declared = env.get_attr("mode_features", indices=0)[0]
+    inner: Any = env.get_attr("observation_space", indices=0)[0].shape
+    outer: Any = env.observation_space.shape
+    if isinstance(declared, str) or callable(declared) or inner == outer:
+        return declared
+    if unwrap_vec_wrapper(env, VecFrameStack) is not None and len(inner) == len(outer) == 1:
+        return np.asarray(declared) + outer[0] - inner[0]  # the newest frame comes last
+    raise ValueError(
+        f"The environment declares mode_features={declared} of its observations of shape {inner}, but a wrapper made their "
+        f"shape {outer}: say with mode_features= where they are now"
+    )
+
+
+def same_selection(first: Any, second: Any) -> bool:
+    """
+    :param first: A selection of mode features
+    :param second: Another
+    :return: Whether they select the same; callables, which cannot be compared, are taken at their word
+    """
+    if callable(first) or callable(second):
+        return callable(first) and callable(second)
+    return bool(np.array_equal(first, second))
 
 
 class ModeFeatures:

@@ -162,6 +162,8 @@ class VisitCounts(nn.Module):
         super().__init__()
         if cell_size <= 0:
             raise ValueError(f"novelty_kwargs['cell_size'] must be positive, got {cell_size}")
+        if table_size < 1:
+            raise ValueError(f"novelty_kwargs['table_size'] must be at least 1, got {table_size}")
         self.cell_size = cell_size
         self.register_buffer("counts", th.zeros(table_size))
         # Fixed odd multipliers: the same cell must hash to the same entry in every process
@@ -206,5 +208,6 @@ class VisitCounts(nn.Module):
         return th.zeros(())
 
 
-# A third measure is a class with the same methods, passed as ``novelty=``
+# A third measure is an nn.Module with the same methods, made with (position_dim, observation_dim, **novelty_kwargs) and passed
+# as ``novelty=``; ``optimizer`` is None if it does not learn, ``with_observation`` (False) asks for the observation features
 NOVELTY_MEASURES: dict[str, Any] = {"rnd": RandomNetworkDistillation, "counts": VisitCounts}

@@ -76,17 +76,20 @@ class ModeTable(Sequence[Mode]):
         """
         return mode in self.names if isinstance(mode, str) else any(mode is each for each in self._modes)
 
-    def index(self, mode: str | int, *args) -> int:
+    def index(self, mode: "str | int | Mode", *args) -> int:
         """
-        :param mode: Name or index of a mode
+        :param mode: Name, index or record of a mode
         :return: Its index
         :raises ValueError: If there is no such mode
         """
+        if isinstance(mode, Mode):
+            mode = mode.name
         if isinstance(mode, str) and mode in self.names:
             return self.names.index(mode)
         if isinstance(mode, (int, np.integer)) and not isinstance(mode, bool) and 0 <= mode < len(self):
             return int(mode)
-        raise ValueError(f"mode={mode!r} is unknown; the modes are {self.names} (or an index below {len(self)})")
+        accepted = f"the modes are {self.names} (or an index below {len(self)})" if self._modes else "there is no mode yet"
+        raise ValueError(f"mode={mode!r} is unknown; {accepted}")
 
     def __str__(self) -> str:
         if not self._modes:

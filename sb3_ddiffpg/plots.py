@@ -28,7 +28,7 @@ def plot_routes(episodes: Mapping[str, Sequence[EpisodeResult]], maze: Any = Non
     for number, (name, runs) in enumerate(episodes.items()):
         color = f"C{number % 10}"
         for i, run in enumerate(runs):
-            style = "-" if run.success else "--"
+            style = "--" if run.success is False else "-"
             axes.plot(run.path[:, 0], run.path[:, 1], style, color=color, alpha=0.35, lw=1, label=None if i else name)
     legend = figure.legend(loc="outside right upper")
     for handle in filter(None, legend.legend_handles):

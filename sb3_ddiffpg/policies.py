@@ -214,7 +214,8 @@ class DiffusionPolicy(BasePolicy):
         self.critic_features_extractor_target.load_state_dict(self.critic_features_extractor.state_dict())
         self.mode_embeddings: th.Tensor
         self.register_buffer("mode_embeddings", th.randn(n_modes + 1, mode_embedding_dim))
-        if "fused" not in self.optimizer_kwargs and optimizer_class in (th.optim.Adam, th.optim.AdamW):
+        chosen = {"fused", "foreach", "differentiable"} & set(self.optimizer_kwargs)
+        if not chosen and optimizer_class in (th.optim.Adam, th.optim.AdamW):
             # One kernel instead of one per parameter: a third of a small update's time
             optimizer_kwargs = {"fused": True, **self.optimizer_kwargs}
         else:
@@ -279,6 +280,18 @@ class DiffusionPolicy(BasePolicy):
         if n_modes != self.n_modes:
             self.inherit([None] * n_modes, [False] * n_modes)
 
+    def fits_but_for_modes(self, state_dict: dict[str, th.Tensor]) -> bool:
+        """
+        :param state_dict: Parameters of another policy
+        :return: Whether ``load_state_dict`` would take them, or will after ``resize``
+        """
+        own = self.state_dict()
+        by_group = ("critics.", "critics_target.", "mode_embeddings")
+        return set(own) == set(state_dict) and all(
+            value.shape[1:] == own[name].shape[1:] if name.startswith(by_group) else value.shape == own[name].shape
+            for name, value in state_dict.items()
+        )
+
     def group_embeddings(self, groups: np.ndarray | th.Tensor) -> th.Tensor:
         """
         :param groups: Rows of the embedding table, ``UNCONDITIONED`` for the zero embedding, shape [N]
@@ -329,12 +342,12 @@ class DiffusionPolicy(BasePolicy):
         held = None
         if group is None and mode is not None:
             held = np.atleast_1d(np.asarray(mode))
-            if held.min() < 0:
-                raise ValueError(f"mode={mode!r} is unknown; modes are numbered from 0")
+            if held.dtype.kind not in "iu" or held.ndim != 1 or held.min(initial=0) < 0:
+                raise ValueError(f"mode={mode!r} is unknown; modes are numbered from 0 to {self.n_modes - 1}")
         elif group is None and (state is not None or episode_start is not None):
             held = self._draw_modes(state, episode_start)
         if held is not None:
-            if held.max() >= self.n_modes:
+            if held.max(initial=UNCONDITIONED) >= self.n_modes:
                 raise ValueError(f"mode={held.max()} (or the one in state) is unknown; this policy has {self.n_modes} modes")
             group = np.where(held < 0, UNCONDITIONED, held + 1)
         self._embeddings_in_use = None
@@ -355,11 +368,15 @@ class DiffusionPolicy(BasePolicy):
     def _draw_modes(self, state: tuple[np.ndarray, ...] | None, episode_start: np.ndarray | None) -> np.ndarray:
         """The modes to follow: kept through an episode, drawn uniformly at its start; -1 while there is none."""
         if state is None:
-            held = np.full(len(np.atleast_1d(episode_start)), -1)  # type: ignore[arg-type]
+            held = np.full(len(np.atleast_1d(episode_start)), UNCONDITIONED)  # type: ignore[arg-type]
             starts = np.ones(len(held), dtype=bool)
         else:
-            held = np.array(state[0])
+            held = np.array(state[0]) if isinstance(state, tuple) and len(state) == 1 else np.empty(0, dtype=object)
+            if held.dtype.kind not in "iu" or held.ndim != 1:
+                raise ValueError(f"state must be what the previous call of predict returned, got {state!r}")
             starts = np.zeros(len(held), dtype=bool) if episode_start is None else np.atleast_1d(episode_start).astype(bool)
+            if len(starts) != len(held):
+                raise ValueError(f"episode_start is given for {len(starts)} environment(s), state for {len(held)}")
         if self.n_modes:
             held[starts] = np.random.randint(0, self.n_modes, size=int(starts.sum()))
         return held

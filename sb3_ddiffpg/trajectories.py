@@ -95,6 +95,16 @@ class RowSet:
         return self.rows[np.random.randint(0, self.size, size=n)]
 
 
+def read_success(info: dict[str, Any], success_key: str | None = None) -> bool | None:
+    """
+    :param info: Of an episode's last step
+    :param success_key: Key that marks a success; None looks for ``SUCCESS_KEYS``
+    :return: Whether the goal was reached, None if the environment does not say
+    """
+    keys = SUCCESS_KEYS if success_key is None else (success_key,)
+    return next((bool(info[key]) for key in keys if key in info), None)
+
+
 class SuccessRule:
     """
     Tells whether a finished episode reached its goal: by the environment's word, or, where no environment ever gives it, by
@@ -114,10 +124,10 @@ class SuccessRule:
         :param episode_return: Sum of its rewards
         :raises ValueError: If ``success_key`` was given and is not there
         """
-        for key in SUCCESS_KEYS if self.success_key is None else (self.success_key,):
-            if key in info:
-                self.has_signal = True
-                return bool(info[key])
+        success = read_success(info, self.success_key)
+        if success is not None:
+            self.has_signal = True
+            return success
         if self.success_key is not None:
             raise ValueError(f"success_key={self.success_key!r} is not in an episode's last info; its keys: {sorted(info)}")
         if self.has_signal:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from torch import nn
 
 from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.clustering import LINKAGES
@@ -24,7 +25,7 @@ def _is_share(value: Any) -> bool:
 
 
 def _is_rate(value: Any) -> bool:
-    return callable(value) or (_is_number(value) and value >= 0)
+    return callable(value) or (_is_number(value) and 0 <= value < np.inf)
 
 
 # Names of arguments, what they accept in words and as a test
@@ -41,12 +42,16 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     (("learning_starts", "mode_patience"), "be an integer of at least 0", lambda value: _is_integer(value) and value >= 0),
     (("gradient_steps",), "be an integer of at least -1", lambda value: _is_integer(value) and value >= -1),
     (("gamma", "tau", "mode_mask_prob", "exploration_fraction", "explore_then_exploit"), "lie in [0, 1]", _is_share),
-    (("action_lr", "reward_scale", "max_grad_norm"), "be positive", lambda value: _is_number(value) and value > 0),
-    (("exploration_v_max",), "be positive and finite", lambda value: _is_number(value) and 0 < value < np.inf),
+    (("max_grad_norm",), "be positive", lambda value: _is_number(value) and value > 0),
+    (
+        ("action_lr", "reward_scale", "exploration_v_max"),
+        "be positive and finite",
+        lambda value: _is_number(value) and 0 < value < np.inf,
+    ),
     (
         ("target_policy_noise", "target_noise_clip", "novelty_scale", "intrinsic_coef", "mode_intrinsic_coef"),
-        "be a number of at least 0",
-        lambda value: _is_number(value) and value >= 0,
+        "be a finite number of at least 0",
+        lambda value: _is_number(value) and 0 <= value < np.inf,
     ),
     (("v_min", "v_max"), "be a finite number", lambda value: _is_number(value) and np.isfinite(value)),
     (("learning_rate",), "be a number of at least 0 or a schedule", _is_rate),
@@ -67,9 +72,15 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     (("linkage",), f"be one of {list(LINKAGES)}", lambda value: value in LINKAGES),
     (
         ("novelty",),
-        f"be one of {list(NOVELTY_MEASURES)} or a class",
-        lambda value: value in NOVELTY_MEASURES or isinstance(value, type),
+        f"be one of {list(NOVELTY_MEASURES)} or a subclass of torch.nn.Module like these",
+        lambda value: value in NOVELTY_MEASURES or (isinstance(value, type) and issubclass(value, nn.Module)),
     ),
+)
+
+
+# Arguments of the policy that follow from those of the algorithm
+SET_BY_CONSTRUCTOR = (
+    *("n_modes", "n_diffusion_steps", "mode_embedding_dim", "n_critics", "n_atoms", "support", "exploration_support"),
 )
 
 
@@ -95,5 +106,13 @@ def check_arguments(model: Any) -> None:
             f"batch_size={model.batch_size} is smaller than the number of groups it may be split over: "
             f"max_modes + 1 = {model.max_modes + 1}"
         )
+    if model.max_successes_per_mode < model.min_mode_size:
+        raise ValueError(
+            f"max_successes_per_mode={model.max_successes_per_mode} is less than min_mode_size={model.min_mode_size}: "
+            "no more trajectories than that would be remembered, and no mode ever be found"
+        )
+    overridden = {name for name in SET_BY_CONSTRUCTOR if name in model.policy_kwargs}
+    if overridden:
+        raise ValueError(f"policy_kwargs must not hold {sorted(overridden)}: DDiffPG's own arguments say these")
     if not model.v_min < model.v_max:
         raise ValueError(f"v_min must be less than v_max, got v_min={model.v_min}, v_max={model.v_max}")

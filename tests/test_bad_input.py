@@ -10,14 +10,15 @@ import torch as th
 from environments import SMALL, AnySpaces, BreaksAt, TwoEnds, assert_no_gaps, assert_same_state, small_model, state_of
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 
 from sb3_ddiffpg import ClusteringCallback, DDiffPG
+from sb3_ddiffpg.evaluation import run_episodes
 
 NUMBERS_FROM_ONE = (
     *("n_diffusion_steps", "n_action_gradient_steps", "n_critics", "n_atoms", "mode_n_steps", "exploration_n_steps"),
     *("recluster_freq", "max_modes", "min_mode_size", "max_successes_per_mode", "max_failures_per_mode"),
-    *("mode_embedding_dim", "batch_size", "buffer_size"),
+    *("mode_embedding_dim", "mode_trials", "batch_size", "buffer_size"),
 )
 BAD_ARGUMENTS = [
     *((name, value) for name in NUMBERS_FROM_ONE for value in (0, -1, 1.5, None, "many", True)),
@@ -49,6 +50,11 @@ BAD_ARGUMENTS = [
     ("linkage", "ward"),
     ("novelty", "icm"),
     ("novelty", 3),
+    ("novelty", int),
+    *((name, np.inf) for name in ("action_lr", "reward_scale", "intrinsic_coef", "learning_rate", "target_policy_noise")),
+    ("max_successes_per_mode", 2),  # fewer than min_mode_size
+    *(("policy_kwargs", {name: 2}) for name in ("n_modes", "n_critics", "support", "mode_embedding_dim")),
+    ("novelty_kwargs", {"table_size": 0}),
     ("success_key", 5),
     ("n_steps", 2),
     ("optimize_memory_usage", True),
@@ -75,7 +81,10 @@ def test_bad_arguments(argument, value):
         ({"n_diffusion_steps": 0}, "n_diffusion_steps must be an integer of at least 1, got 0"),
         ({"gamma": 1.1}, r"gamma must lie in \[0, 1\], got 1.1"),
         ({"linkage": "ward"}, r"linkage must be one of \['average', .*\], got 'ward'"),
-        ({"novelty": "icm"}, r"novelty must be one of \['rnd', 'counts'\] or a class, got 'icm'"),
+        (
+            {"novelty": "icm"},
+            r"novelty must be one of \['rnd', 'counts'\] or a subclass of torch.nn.Module like these, got 'icm'",
+        ),
         ({"v_min": 7.0}, r"v_min must be less than v_max, got v_min=7.0, v_max=5.0"),
         ({"n_steps": 3}, "n_steps=3 is not supported: use mode_n_steps and exploration_n_steps instead"),
         ({"mode_features": [7]}, r"mode_features=\[7\] exceeds the observation's 2 components"),
@@ -155,7 +164,73 @@ def test_a_success_key_that_is_missing():
         model.learn(100)
 
 
+def test_modes_belong_to_their_features(tmp_path):
+    small_model(DummyVecEnv([TwoEnds] * 4), mode_features=[0, 1]).learn(400).save(tmp_path / "model")
+    assert DDiffPG.load(tmp_path / "model", mode_features=np.array([0, 1])).modes.names
+    for other in ([0], [1, 0]):
+        with pytest.raises(ValueError, match=r"mode_features=.*: the modes of this model were found in \[0, 1\]"):
+            DDiffPG.load(tmp_path / "model", mode_features=other)
+
+
+def test_positions_behind_a_wrapper_that_stacks_frames():
+    """The newest frame counts; behind a wrapper that does who knows what, the user must say."""
+    env = VecFrameStack(DummyVecEnv([TwoEnds] * 2), 3)
+    model = small_model(env).learn(40)
+    np.testing.assert_array_equal(model.replay_buffer.features.selection, [4])
+    positions = [env.get_attr("x", i)[0] for i in range(2)]
+    np.testing.assert_allclose(model.replay_buffer.last_positions()[:, 0], positions, atol=1e-6)
+    (episode,) = run_episodes(model, env, 1)
+    assert len(episode.path) == episode.length + 1 and (abs(episode.path[-1, 0]) >= 1) == episode.success
+
+    class Halved(VecEnvWrapper):
+        def __init__(self, venv):
+            super().__init__(venv, observation_space=spaces.Box(-2.0, 2.0, (1,)))
+
+        def reset(self):
+            return self.venv.reset()[:, 1:]
+
+        def step_wait(self):
+            observations, rewards, dones, infos = self.venv.step_wait()
+            for env in np.flatnonzero(dones):
+                infos[env]["terminal_observation"] = infos[env]["terminal_observation"][1:]
+            return observations[:, 1:], rewards, dones, infos
+
+    with pytest.raises(ValueError, match=r"mode_features=\[0\] of its observations of shape \(2,\).* shape \(1,\): say with"):
+        small_model(Halved(DummyVecEnv([TwoEnds] * 2)))
+    small_model(Halved(DummyVecEnv([TwoEnds] * 2)), mode_features=[0]).learn(40)
+
+
+def test_normalised_rewards_are_warned_of():
+    env = VecNormalize(DummyVecEnv([TwoEnds] * 2))
+    with pytest.warns(UserWarning, match="norm_reward=False leaves them in reward units"):
+        small_model(env).learn(20)
+
+
+def test_parameters_that_do_not_fit_change_nothing(trained):
+    other = small_model(DummyVecEnv([TwoEnds] * 4), policy_kwargs={"net_arch": [32]})
+    other.policy.resize(4)
+    model = deepcopy(trained)
+    names, sizes = model.modes.names, [rows.size for rows in model.replay_buffer.mode_rows]
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        model.set_parameters(other.get_parameters())
+    assert model.modes.names == names and [rows.size for rows in model.replay_buffer.mode_rows] == sizes
+
+
+def test_optimizer_arguments_that_exclude_the_fused_one():
+    for arguments in ({"foreach": True}, {"fused": False}):
+        model = small_model(TwoEnds(), policy_kwargs={"net_arch": [16], "optimizer_kwargs": arguments})
+        assert not model.actor.optimizer.defaults["fused"]
+    assert small_model(TwoEnds()).actor.optimizer.defaults["fused"]
+
+
 # ---------------------------------------------------------------------- values that are not finite
+
+
+def test_a_diverged_policy_does_not_step_the_environments():
+    """``BreaksAt`` refuses an action of NaN, as a simulator would crash of it."""
+    model = small_model(breaking("observation", 10**9), learning_rate=1e6)
+    with pytest.raises(ValueError, match=r"The policy's action \(has training diverged\?\) of environment 0 is not finite"):
+        model.learn(1000)
 
 
 def breaking(part, when, broken_env=1, n_envs=3, wrap=lambda env: env):

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from environments import WIDE, AnySpaces, TwoEnds, small_model
+from gymnasium import spaces
 from maze_routes import ROUTES
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.evaluation import run_episodes
@@ -74,6 +76,42 @@ def test_paths_are_in_metres_behind_a_normalising_wrapper():
     for episode, same in zip(run_episodes(Unnormalising(), normalised, 4, mode="above"), expected, strict=True):
         np.testing.assert_allclose(episode.path, same.path, atol=1e-4)
         assert episode.episode_return == same.episode_return == 1.0
+
+
+@pytest.mark.parametrize(("success_key", "said"), [("solved", True), (None, None)])
+def test_success_is_what_the_model_was_told_to_look_for(success_key, said):
+    env = DummyVecEnv([lambda: TwoEnds(success_key)] * 3)
+
+    class Rightwards:
+        def predict(self, obs, **kwargs):
+            return np.ones((len(obs), 1)), None
+
+    model = Rightwards()
+    model.success_key = success_key
+    assert [episode.success for episode in run_episodes(model, env, 6)] == [said] * 6
+
+
+def test_numbers_as_observations():
+    class Number(AnySpaces):
+        def reset(self, **kwargs):
+            return int(super().reset(**kwargs)[0]), {}
+
+        def step(self, action):
+            observation, *rest = super().step(action)
+            return (int(observation), *rest)
+
+    env = DummyVecEnv([lambda: Number(spaces.Discrete(5))] * 2)
+    model = small_model(env, **WIDE)
+    assert [len(episode.path) == episode.length + 1 for episode in run_episodes(model, env, 4)] == [True] * 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"), [((TwoEnds(), 2), "env"), ((None, 0), "n_episodes"), ((None, 7.0), "n_episodes")]
+)
+def test_bad_arguments(arguments, name):
+    env = arguments[0] or DummyVecEnv([TwoEnds])
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        run_episodes(Scripted(), env, arguments[1])
 
 
 def test_routes_are_drawn_over_the_maze():

@@ -33,7 +33,7 @@ def test_a_commanded_mode_is_its_embedding(trained):
         with th.no_grad():
             expected = trained.actor(tensor, deterministic=True, embeddings=embedding).cpu().numpy()
         expected = trained.policy.unscale_action(expected)
-        for command in (mode.name, index, np.int64(index), [mode.name] * 10, np.full(10, index)):
+        for command in (mode.name, index, mode, np.int64(index), [mode.name] * 10, [mode] * 10, np.full(10, index)):
             given, _ = trained.predict(observations, deterministic=True, mode=command)
             np.testing.assert_array_equal(given, expected)
         actions.append(expected)
@@ -108,6 +108,29 @@ def test_a_state_of_another_model_is_noticed(trained):
         trained.predict(some_observations(2), state=(np.array([0, 7]),))
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"mode": []}, r"mode=\[\] is unknown"),
+        ({"state": ()}, "state must be what the previous call of predict returned, got"),
+        ({"state": np.array([0, 1])}, "state must be what the previous call of predict returned, got"),
+        ({"state": (np.array([0.5, 1.0]),)}, "state must be what the previous call of predict returned, got"),
+        ({"state": (np.array([0, 1]),), "episode_start": np.ones(3, bool)}, "for 3 environment.*state for 2"),
+        ({"state": (np.array([], dtype=int),)}, "of 0 for 2 observation"),
+        ({"episode_start": np.ones(0, bool)}, "of 0 for 2 observation"),
+    ],
+)
+def test_states_that_cannot_be(trained, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        trained.predict(some_observations(2), **arguments)
+
+
+@pytest.mark.parametrize("mode", ["mode_0", 0.7, True, -1, 2, [[0, 1]]])
+def test_the_policy_alone_knows_numbers(trained, mode):
+    with pytest.raises(ValueError, match="unknown"):
+        trained.policy.predict(some_observations(2), mode=mode)
+
+
 def test_evaluation_with_sb3_draws_a_mode_for_each_episode(trained):
     held = []
 
@@ -127,7 +150,7 @@ def test_without_modes_nothing_is_commanded():
     np.testing.assert_array_equal(given, expected)
     np.testing.assert_array_equal(state[0], [-1, -1, -1])
     np.testing.assert_array_equal(model.predict(observations, state=state, deterministic=True)[0], expected)
-    with pytest.raises(ValueError, match=r"mode='mode_0' is unknown; the modes are \[\]"):
+    with pytest.raises(ValueError, match="mode='mode_0' is unknown; there is no mode yet"):
         model.predict(observations, mode="mode_0")
     assert len(model.modes) == 0 and "no mode yet" in str(model.modes)
 

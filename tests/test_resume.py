@@ -11,7 +11,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_ddiffpg import DDiffPG, ModeReplayBuffer
+from sb3_ddiffpg import DDiffPG, Mode, ModeReplayBuffer
+from sb3_ddiffpg.trajectories import NO_MODE
 
 
 def two_ends(n_envs=4):
@@ -179,16 +180,24 @@ def test_waiting_modes_count(max_modes, tmp_path):
 # ---------------------------------------------------------------------- what does not fit together
 
 
-def other_buffers(tmp_path):
+def other_buffers(tmp_path, run_id):
     other = small_model(two_ends())
     other.learn(40)
     other.save_replay_buffer(tmp_path / "no_modes")
+    other.learn(360)
+    assert len(other.modes) == 2
+    other.save_replay_buffer(tmp_path / "other_modes")
+    same_run = small_model(two_ends(), mode_features=[0, 1])
+    same_run.run_id = run_id
+    same_run.save_replay_buffer(tmp_path / "other_features")
     space = AnySpaces().observation_space
     plain = ReplayBuffer(10, space, AnySpaces().action_space)
     for name, content in (("plain", plain), ("junk", [1, 2, 3])):
         (tmp_path / f"{name}.pkl").write_bytes(pickle.dumps(content))
     return {
-        "no_modes": (ValueError, "holds 0 modes, the model 2"),
+        "no_modes": (ValueError, "was not saved by this model: its modes are others"),
+        "other_modes": (ValueError, "was not saved by this model: its modes are others"),
+        "other_features": (ValueError, r"was filled with mode_features=\[0 1\], not \[0\]"),
         "plain": (ValueError, "is a ReplayBuffer, not a ModeReplayBuffer"),
         "junk": (ValueError, "is a list, not a ModeReplayBuffer"),
     }
@@ -198,13 +207,54 @@ def test_a_buffer_that_does_not_fit_is_refused_and_the_old_one_stays(trained, tm
     trained.save(tmp_path / "model")
     model = DDiffPG.load(tmp_path / "model", env=two_ends())
     before = model.replay_buffer
-    for name, (error, message) in other_buffers(tmp_path).items():
+    for name, (error, message) in other_buffers(tmp_path, model.run_id).items():
         with pytest.raises(error, match=message):
             model.load_replay_buffer(tmp_path / name)
         assert model.replay_buffer is before
     with pytest.raises(FileNotFoundError):
         model.load_replay_buffer(tmp_path / "nothing")
     assert model.replay_buffer is before
+
+
+def test_a_model_without_modes_takes_any_buffer(trained, tmp_path):
+    trained.save_replay_buffer(tmp_path / "buffer")
+    model = small_model(two_ends())
+    model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer.size() > 0 and not model.replay_buffer.mode_rows
+    model.recluster()
+    assert len(model.modes) == 2
+
+
+def test_the_settings_of_the_model_stay(trained, tmp_path):
+    trained.save(tmp_path / "model")
+    trained.save_replay_buffer(tmp_path / "buffer")
+    model = DDiffPG.load(tmp_path / "model", env=two_ends(), max_successes_per_mode=4, success_key="nowhere")
+    silent(model, trained)
+    model.load_replay_buffer(tmp_path / "buffer")
+    model.recluster()
+    assert [mode.n_trajectories for mode in model.modes] == [4, 4]
+    with pytest.raises(ValueError, match="success_key='nowhere'"):
+        model.learn(100, reset_num_timesteps=False)
+
+
+def test_trajectories_follow_the_names_of_their_modes(saved):
+    """The buffer was saved later than the model: by then the modes had other numbers, and one more was known."""
+    model, folder = saved
+    route = {mode.name: np.sign(mode.representative[-1, 0]) for mode in model.modes}
+    later = DDiffPG.load(folder / "model", env=two_ends())
+    later.load_replay_buffer(folder / "buffer")
+    improved = later.replay_buffer.target_actions.copy()
+    later.replay_buffer.renumber_modes([2, 0], 3)
+    later._modes = [later._modes[1], Mode("mode_9", born_at=7), later._modes[0]]
+    later.save_replay_buffer(folder / "later")
+    loaded = DDiffPG.load(folder / "model", env=two_ends())
+    loaded.load_replay_buffer(folder / "later")
+    buffer = loaded.replay_buffer
+    assert len(buffer.mode_rows) == 2 and all(rows.size for rows in buffer.mode_rows)
+    for trajectory in buffer.trajectories(True):
+        if trajectory.mode != NO_MODE:
+            assert np.sign(buffer.full_path(trajectory)[-1, 0]) == route[loaded.modes[trajectory.mode].name]
+    np.testing.assert_array_equal(buffer.target_actions, improved)
 
 
 def test_a_buffer_for_another_number_of_environments_is_refused(trained, tmp_path):
