@@ -24,7 +24,8 @@ class ModeBatch(NamedTuple):
     Observations are [N, ...] (or dicts of such), ``actions``, ``target_actions`` [G, n, action_dim], ``rewards`` and
     ``discounts`` [G, n]. ``active`` [G] is False for a mode without any transition, whose rows are a stand-in that must
     not train it. ``imitated`` [G, n] is False for these and for steps off the mode's route, which the policy must not learn.
-    ``rows`` [G, n] and ``windows`` [G, n, n_steps] (-1 where a window ends early) say where in the buffer the transitions lie.
+    ``rows`` [G, n] and ``windows`` [G, n, n_steps] (-1 where a window ends early, or beyond the mode's route) say where in the
+    buffer the transitions lie.
     """
 
     observations: Any
@@ -309,7 +310,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
 
     def mark_off_route(self, trajectory: Trajectory, members: list[Trajectory]) -> None:
         """
-        Mark the steps of a foreign trajectory that lead away from the route of the mode that it was told to follow.
+        Mark the steps of a foreign trajectory that lead away from the route of the mode that it was told to follow, or to
+        another goal close by.
 
         :param trajectory: The foreign trajectory
         :param members: Goal-reached trajectories of that mode
@@ -317,8 +319,18 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         trajectory.foreign = True
         route = np.concatenate([self.path(member) for member in members])
         reached = self.full_path(trajectory)[1:] / self._feature_scale
-        radius = self.route_share * float(np.linalg.norm(np.ptp(route, axis=0)))
-        self.off_route[trajectory.rows] = cdist(reached, route).min(axis=1) > radius
+        extent = float(np.linalg.norm(np.ptp(route, axis=0)))
+        off_route = cdist(reached, route).min(axis=1) > self.route_share * extent
+        ends = np.stack([self.path(member)[-1] for member in members])
+        off_route[-1] |= cdist(reached[-1:], ends).min() > self.loop_share * extent
+        self.off_route[trajectory.rows] = off_route
+
+    def readmit(self, trajectory: Trajectory) -> None:
+        """
+        :param trajectory: A foreign trajectory whose mode has ended: it is a success like any other again
+        """
+        self.off_route[trajectory.rows] = False
+        trajectory.foreign, trajectory.commanded, trajectory.mode = False, None, NO_MODE
 
     def _change_mode(self, trajectory: Trajectory, mode: int, parents: list[int | None]) -> None:
         """Target actions are inherited with the critics that made them, or start again from the action."""
@@ -376,7 +388,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             active=self.to_torch(active),
             imitated=self.to_torch(imitated),
             rows=rows,
-            windows=windows,
+            windows=np.where(lost, -1, windows),
         )
 
     def _windows(self, rows: np.ndarray, exploration_n_steps: int, mode_n_steps: int) -> np.ndarray:

@@ -73,7 +73,7 @@ def find_modes(
     :return: The new modes, or None when nothing could take the place of the old ones
     """
     given_up = _given_up(modes, trials) if buffer.has_success_signal else []
-    found, failures = buffer.trajectories(success=True), buffer.trajectories(success=False)
+    found, failures = _trajectories(buffer, {mode.name for index, mode in enumerate(modes) if index not in given_up})
     abandoned = [trajectory for trajectory in found if trajectory.mode in given_up]
     successes = [trajectory for trajectory in found if trajectory.mode not in given_up]
     distances = np.zeros((len(successes), len(successes)), dtype=np.float32)
@@ -98,8 +98,8 @@ def find_modes(
         if trajectory.mode == NO_MODE and label != NO_MODE and told.get(trajectory.commanded or "") == label:
             modes[inheritance.parents[label]].misses = 0
     failure_labels = np.array([told.get(failure.commanded or "", NO_MODE) for failure in failures], dtype=int)
-    # A mode must see its own failures; those that nobody told where to go are shared out by likeness, as in the paper
-    strayed = np.flatnonzero([failure.commanded is None for failure in failures])
+    # A mode must see its own failures; those that no mode answers for are shared out by likeness, as in the paper
+    strayed = np.flatnonzero([failure.commanded not in told and not failure.foreign for failure in failures])
     if n_new and len(strayed):
         members = [[buffer.path(successes[i]) for i in np.flatnonzero(labels == mode)] for mode in range(n_new)]
         failure_labels[strayed] = assign_to_nearest([buffer.path(failures[i]) for i in strayed], members, rng)
@@ -109,6 +109,8 @@ def find_modes(
             buffer.mark_off_route(successes[i], [successes[j] for j in np.flatnonzero(labels == mode)])
         failures = [*failures, *(successes[i] for i in foreign)]
         failure_labels = np.concatenate((failure_labels, list(foreign.values()))).astype(int)
+        order = np.argsort([failure.serial for failure in failures])
+        failures, failure_labels = [failures[i] for i in order], failure_labels[order]
         own = np.array([i not in foreign for i in range(len(successes))], dtype=bool)
         successes = [trajectory for trajectory, is_own in zip(successes, own, strict=True) if is_own]
         labels, distances = labels[own], distances[np.ix_(own, own)]
@@ -149,6 +151,16 @@ def _defend(
     for old in set(range(len(modes))) - set(inheritance.merged) - set(inheritance.retired):
         modes[old].doubts = 0
     return labels
+
+
+def _trajectories(buffer: ModeReplayBuffer, names: set[str]) -> tuple[list[Trajectory], list[Trajectory]]:
+    """Goal-reached and failed trajectories, in order of finishing; those foreign to a mode count as failed while it lives."""
+    successes, failures = buffer.trajectories(success=True), buffer.trajectories(success=False)
+    homeless = [trajectory for trajectory in failures if trajectory.foreign and trajectory.commanded not in names]
+    for trajectory in homeless:
+        buffer.readmit(trajectory)
+    successes = sorted([*successes, *homeless], key=lambda trajectory: trajectory.serial)
+    return successes, [trajectory for trajectory in failures if trajectory not in homeless]
 
 
 def _given_up(modes: Sequence[Mode], trials: int) -> list[int]:

@@ -439,6 +439,33 @@ def test_a_mode_is_shown_a_foreign_trajectory_as_a_way_off_its_route():
     assert len(seen) == 12
 
 
+def test_another_goal_beside_the_route_is_off_it():
+    """Near the route all the way, but not at its end: paid in full, it would draw the mode to the wrong goal."""
+    buffer = make_buffer(500, mode_features=[0, 1])
+    fill(buffer, [straight(8)] * 3)
+    fill(buffer, [np.array([[0, 0], [1, 0], [2, 0], [3, 0.6]], dtype=np.float32)])
+    fill(buffer, [straight(8) + np.float32([0, 0.3])])
+    *members, elsewhere, there = buffer.trajectories(True)
+    for trajectory, off_route in ((elsewhere, [False, False, True]), (there, [False] * 8)):
+        buffer.mark_off_route(trajectory, members)
+        assert trajectory.foreign and buffer.off_route[trajectory.rows].tolist() == off_route
+    buffer.readmit(elsewhere)
+    assert not elsewhere.foreign and not buffer.off_route[elsewhere.rows].any()
+
+
+def test_intrinsic_rewards_end_where_the_route_does():
+    buffer = make_buffer(500, mode_features=[0, 1])
+    fill(buffer, [straight(8)] * 2)
+    for trajectory in buffer.trajectories(True):
+        buffer.off_route[trajectory.rows[4:6]] = True
+    buffer.assign_modes(buffer.trajectories(True), np.zeros(2), [], np.zeros(0), [None])
+    batch = buffer.sample_modes(400, GAMMA, 3, 3)
+    step = batch.rows % 8
+    lengths = (batch.windows >= 0).sum(axis=-1)
+    np.testing.assert_array_equal(lengths[0], np.minimum(3, 8 - step[0]))
+    np.testing.assert_array_equal(lengths[1], np.array([3, 3, 2, 1, 0, 0, 2, 1])[step[1]])
+
+
 def test_full_of_unfinished_episodes_is_a_clear_error_that_loses_nothing():
     buffer = make_buffer(buffer_size=30, mode_features=[0, 1])
     fill(buffer, [np.zeros((11, 2), dtype=np.float32)])

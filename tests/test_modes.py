@@ -500,6 +500,38 @@ def test_a_route_that_was_found_against_orders_is_a_mode(two_routes):
     assert [trajectory for trajectory in buffer.trajectories(False) if trajectory.foreign] == [strayed]
 
 
+def test_what_was_foreign_to_a_mode_that_has_ended(two_routes):
+    """It is a success like any other again; and failures go to the mode that is nearest now."""
+    model, buffer = two_routes, two_routes.replay_buffer
+    walk(model, "up", 3)
+    walk(model, "up", 2, success=False, part=0.7)
+    strayed, failed = buffer.trajectories(True)[-3:], buffer.trajectories(False)[-2:]
+    for trajectory in (*strayed, *failed):
+        trajectory.commanded = "mode_0"
+    assert model.recluster() == []
+    down = model.modes.index("mode_0")
+    assert all(t.mode == down for t in (*strayed, *failed)) and all(t.foreign for t in strayed)
+    model.modes["mode_0"].misses = model.mode_trials
+    assert model.recluster() == ["mode_0 retired"] and model.modes.names == ["mode_1"]
+    assert not any(t.foreign or buffer.off_route[t.rows].any() for t in strayed)
+    assert all(t in buffer.trajectories(True) and t.mode == 0 for t in strayed) and model.modes[0].n_trajectories == 7
+    assert all(t.mode == 0 for t in failed)
+
+
+def test_a_mode_is_shown_the_newest_failures(two_routes):
+    """Those foreign to it among them, in order of finishing."""
+    model, buffer = two_routes, two_routes.replay_buffer
+    buffer.max_failures_per_mode = 4
+    for _ in range(3):
+        walk(model, "up", 1, success=False, part=0.7)
+        walk(model, "down", 1)
+        buffer.trajectories(True)[-1].commanded = "mode_1"
+    newest = buffer.trajectories(False)[-2:], buffer.trajectories(True)[-2:]
+    model.recluster()
+    up = model.modes.index("mode_1")
+    assert {t.serial for t in buffer.trajectories(False) if t.mode == up} == {t.serial for part in newest for t in part}
+
+
 def test_what_a_dormant_mode_finds_is_its_own(two_routes):
     """As after loading a model without its buffer; "up" has been found again, "down" not yet."""
     model = two_routes
