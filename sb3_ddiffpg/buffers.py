@@ -66,6 +66,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         for the next clustering, but trains no mode
     :param min_direct: The mode's shortest successes, so many, are never detours
     :param n_path_points: Points to which a trajectory's path is resampled for clustering
+    :param normalize_distances: Whether DTW distances are divided by the square root of the path's length, which makes them
+        about the mean distance along the way; False for the root of the summed squares, to which the paper's thresholds refer
     :param loop_share: Radius within which a path that comes back has made a loop, as a share of the path's extent
     :param route_share: Distance beyond which a step is off a mode's route, as a share of the route's extent
     :raises ValueError: If a size is not positive or ``optimize_memory_usage`` is asked for
@@ -90,6 +92,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         max_length_ratio: float = 1.5,
         min_direct: int = 5,
         n_path_points: int = 48,
+        normalize_distances: bool = True,
         loop_share: float = 0.05,
         route_share: float = 0.1,
     ) -> None:
@@ -110,6 +113,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.max_length_ratio = max_length_ratio
         self.min_direct = min_direct
         self.n_path_points = n_path_points
+        self.normalize_distances = normalize_distances
         self.loop_share = loop_share
         self.route_share = route_share
         super().__init__(
@@ -130,7 +134,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         super().reset()
         self.owner: tuple[str, list[str]] = ("", [])  # run and names of its modes, noted when it is saved
         self._feature_scale: np.ndarray | None = None
-        self._distances = DistanceCache()
+        self._distances = DistanceCache(self.normalize_distances)
         self._mode_position = np.empty(0, dtype=np.int32)
         self.mode_rows: list[RowSet] = []
 

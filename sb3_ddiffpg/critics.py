@@ -8,6 +8,10 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+# The projected distribution of the twin with the lower mean; or the element-wise minimum of all, with binary cross-entropy, as
+# in the authors' code
+TWIN_TARGETS = ("lower_mean", "elementwise")
+
 
 class ModeCritics(nn.Module):
     """
@@ -24,6 +28,7 @@ class ModeCritics(nn.Module):
     :param n_atoms: Atoms of the value distribution, 1 for scalar critics
     :param support: Lower and upper end of the values of the modes' critics
     :param exploration_support: The same for the exploratory group
+    :param twin_target: What the C51 critics of a group learn from, one of ``TWIN_TARGETS``
     """
 
     optimizer: th.optim.Optimizer
@@ -42,11 +47,12 @@ class ModeCritics(nn.Module):
         n_atoms: int = 51,
         support: tuple[float, float] = (0.0, 5.0),
         exploration_support: tuple[float, float] = (0.0, 5.0),
+        twin_target: str = "lower_mean",
     ) -> None:
         super().__init__()
         if not net_arch:
             raise ValueError("net_arch['qf'] must name at least one hidden layer, got []")
-        self.n_critics, self.n_atoms = n_critics, n_atoms
+        self.n_critics, self.n_atoms, self.twin_target = n_critics, n_atoms, twin_target
         self.features_dim, self.action_dim = features_dim, action_dim
         self.activation = activation_fn()
         sizes = [features_dim + action_dim, *net_arch, n_atoms]
@@ -116,8 +122,8 @@ class ModeCritics(nn.Module):
     @th.no_grad()
     def bellman_target(self, features: th.Tensor, actions: th.Tensor, rewards: th.Tensor, discounts: th.Tensor) -> th.Tensor:
         """
-        Target of the lower-mean twin: its distribution, shifted by the reward and projected on the support, so that it
-        stays a distribution (an element-wise minimum of two would not sum to one).
+        Target of the lower-mean twin: its distribution, shifted by the reward and projected on the support. With
+        ``twin_target="elementwise"`` the minimum of all twins' projections, atom by atom, which does not sum to one.
 
         :param features: Features of the bootstrap states, shape [G, n, F]
         :param actions: Actions there, shape [G, n, A]
@@ -131,6 +137,10 @@ class ModeCritics(nn.Module):
         low, high = self.lower[kind][:, None], self.upper[kind][:, None]  # [G, 1]
         if self.n_atoms == 1:
             return (rewards + discounts * values).clamp(low, high)[..., None]
+        if self.twin_target == "elementwise":
+            twins = logits.softmax(dim=-1).unbind(dim=1)
+            projections = [project_distribution(twin, self.atoms[kind][:, None, :], rewards, discounts) for twin in twins]
+            return th.stack(projections).amin(dim=0)
         index = lower_twin[:, None, :, None].expand(-1, 1, -1, self.n_atoms)
         probabilities = logits.gather(1, index).squeeze(1).softmax(dim=-1)  # [G, n, n_atoms]
         return project_distribution(probabilities, self.atoms[kind][:, None, :], rewards, discounts)
@@ -145,6 +155,10 @@ class ModeCritics(nn.Module):
         logits = self(features, actions)
         if self.n_atoms == 1:
             return (logits - targets[:, None]).pow(2).mean(dim=(2, 3)).sum(dim=1)
+        if self.twin_target == "elementwise":
+            probabilities, targets = logits.softmax(dim=-1), targets[:, None].expand_as(logits)
+            errors = F.binary_cross_entropy(probabilities, targets, reduction="none")
+            return errors.sum(dim=-1).mean(dim=2).sum(dim=1)
         return -(targets[:, None] * F.log_softmax(logits, dim=-1)).sum(dim=-1).mean(dim=2).sum(dim=1)
 
     def action_gradient(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:

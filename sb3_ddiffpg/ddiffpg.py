@@ -69,6 +69,8 @@ class DDiffPG(OffPolicyAlgorithm):
     :param action_optimizer: ``"adam"``, ``"normalized"`` or ``"sgd"`` (the paper's equation), see ``target_actions.ascend``
     :param n_critics: Critics per mode, the minimum over them is used
     :param n_atoms: Atoms of the critics' value distribution (C51); 1 for scalar critics
+    :param twin_target: ``"lower_mean"``: the twins learn from the distribution of the one with the lower mean;
+        ``"elementwise"``: from the minimum of their distributions, atom by atom, as in the authors' code
     :param v_min: Lower end of the values' support
     :param v_max: Upper end of the support of the modes' critics
     :param exploration_v_max: Upper end of the support of the exploratory critics (the lower end is 0)
@@ -153,6 +155,7 @@ class DDiffPG(OffPolicyAlgorithm):
         action_optimizer: str = "adam",
         n_critics: int = 2,
         n_atoms: int = 51,
+        twin_target: str = "lower_mean",
         v_min: float = 0.0,
         v_max: float = 5.0,
         exploration_v_max: float = 10.0,
@@ -227,6 +230,7 @@ class DDiffPG(OffPolicyAlgorithm):
         self.action_optimizer = action_optimizer
         self.n_critics = n_critics
         self.n_atoms = n_atoms
+        self.twin_target = twin_target
         self.v_min = v_min
         self.v_max = v_max
         self.exploration_v_max = exploration_v_max
@@ -288,6 +292,7 @@ class DDiffPG(OffPolicyAlgorithm):
             "mode_embedding_dim": self.mode_embedding_dim,
             "n_critics": self.n_critics,
             "n_atoms": self.n_atoms,
+            "twin_target": self.twin_target,
             "support": (self.v_min, self.v_max),
             "exploration_support": (0.0, self.exploration_v_max),
             **self.policy_kwargs,

@@ -127,6 +127,7 @@ class DiffusionPolicy(BasePolicy):
     :param n_atoms: Atoms of the value distribution, 1 for scalar critics
     :param support: Lower and upper end of the values of the modes' critics
     :param exploration_support: The same for the exploratory critics
+    :param twin_target: What the twins learn from, see ``ModeCritics``
     """
 
     actor: DiffusionActor
@@ -154,6 +155,7 @@ class DiffusionPolicy(BasePolicy):
         n_atoms: int = 51,
         support: tuple[float, float] = (0.0, 5.0),
         exploration_support: tuple[float, float] = (0.0, 5.0),
+        twin_target: str = "lower_mean",
     ) -> None:
         if features_extractor_class is None:
             is_dict = isinstance(observation_space, spaces.Dict)
@@ -179,6 +181,7 @@ class DiffusionPolicy(BasePolicy):
             n_atoms=n_atoms,
             support=support,
             exploration_support=exploration_support,
+            twin_target=twin_target,
         )
         actor_arch, critic_arch = get_actor_critic_arch([128, 128] if net_arch is None else net_arch)
         extractor = self.make_features_extractor()
@@ -204,6 +207,7 @@ class DiffusionPolicy(BasePolicy):
             n_atoms=n_atoms,
             support=support,
             exploration_support=exploration_support,
+            twin_target=twin_target,
         )
         self.critics = ModeCritics(**critic_arguments)
         self.critics_target = ModeCritics(**critic_arguments)

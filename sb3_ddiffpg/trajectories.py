@@ -139,9 +139,14 @@ class SuccessRule:
 
 
 class DistanceCache:
-    """Pairwise DTW distances of the last set of paths: of the next set only the new pairs are computed."""
+    """
+    Pairwise DTW distances of the last set of paths: of the next set only the new pairs are computed.
 
-    def __init__(self) -> None:
+    :param normalize: See ``dtw_distances``
+    """
+
+    def __init__(self, normalize: bool = True) -> None:
+        self.normalize = normalize
         self.serials = np.zeros(0, dtype=np.int64)
         self.distances = np.zeros((0, 0), dtype=np.float32)
 
@@ -157,10 +162,10 @@ class DistanceCache:
         distances[np.ix_(known, known)] = self.distances[np.ix_(old, old)]
         if not known.all():
             new = [path for path, is_known in zip(paths, known, strict=True) if not is_known]
-            distances[np.ix_(~known, ~known)] = dtw_distances(new)
+            distances[np.ix_(~known, ~known)] = dtw_distances(new, normalize=self.normalize)
             if known.any():
                 seen = [path for path, is_known in zip(paths, known, strict=True) if is_known]
-                across = dtw_distances(new, seen)
+                across = dtw_distances(new, seen, self.normalize)
                 distances[np.ix_(~known, known)] = across
                 distances[np.ix_(known, ~known)] = across.T
         self.serials, self.distances = serials, distances

@@ -8,6 +8,7 @@ from torch import nn
 
 from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.clustering import LINKAGES
+from sb3_ddiffpg.critics import TWIN_TARGETS
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES
 from sb3_ddiffpg.target_actions import ACTION_OPTIMIZERS
 
@@ -68,6 +69,7 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     ),
     (("success_key",), "be a string or None", lambda value: value is None or isinstance(value, str)),
     (("action_optimizer",), f"be one of {list(ACTION_OPTIMIZERS)}", lambda value: value in ACTION_OPTIMIZERS),
+    (("twin_target",), f"be one of {list(TWIN_TARGETS)}", lambda value: value in TWIN_TARGETS),
     (("backup_embedding",), "be one of ['mode', 'masked']", lambda value: value in ("mode", "masked")),
     (("linkage",), f"be one of {list(LINKAGES)}", lambda value: value in LINKAGES),
     (
@@ -80,7 +82,8 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
 
 # Arguments of the policy that follow from those of the algorithm
 SET_BY_CONSTRUCTOR = (
-    *("n_modes", "n_diffusion_steps", "mode_embedding_dim", "n_critics", "n_atoms", "support", "exploration_support"),
+    *("n_modes", "n_diffusion_steps", "mode_embedding_dim", "n_critics", "n_atoms", "twin_target", "support"),
+    "exploration_support",
 )
 
 

@@ -47,6 +47,7 @@ BAD_ARGUMENTS = [
     ("gradient_steps", 1.5),
     ("action_optimizer", "adamw"),
     ("backup_embedding", "none"),
+    ("twin_target", "mean"),
     ("linkage", "ward"),
     ("novelty", "icm"),
     ("novelty", 3),

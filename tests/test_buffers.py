@@ -339,6 +339,13 @@ def test_distances_of_the_cache_are_fresh_ones():
         np.testing.assert_allclose(distances, dtw_distances([paths[i] for i in kept]) if kept else np.zeros((0, 0)), rtol=1e-6)
 
 
+def test_distances_as_in_the_paper():
+    buffer = make_buffer(500, mode_features=[0, 1], normalize_distances=False, n_path_points=9)
+    fill(buffer, [straight(8), straight(8) + np.float32([0, 3])])
+    # Nine points, each three metres from its partner
+    np.testing.assert_allclose(buffer.success_distances(buffer.trajectories(True))[0, 1], np.sqrt(9 * 3.0**2), rtol=1e-5)
+
+
 def test_cached_distances_follow_the_trajectories():
     buffer = make_buffer(buffer_size=60, mode_features=[0, 1])
     rng = np.random.default_rng(0)

@@ -98,6 +98,24 @@ def test_scalar_target_is_the_clipped_minimum():
     th.testing.assert_close(critics.bellman_target(features, actions, rewards, discounts), expected)
 
 
+def test_elementwise_target_by_hand():
+    """The authors' code: binary cross-entropy with the minimum of the two projected distributions."""
+    th.manual_seed(0)
+    critics = ModeCritics(3, 2, [16], n_groups=2, n_atoms=11, twin_target="elementwise")
+    th.nn.init.normal_(critics.weights[-1])
+    features, actions = th.randn(2, 6, 3), th.rand(2, 6, 2)
+    rewards, discounts = th.rand(2, 6), th.full((2, 6), 0.9)
+    twins = critics(features, actions).softmax(dim=-1)
+    atoms = critics.atoms[[0, 1]][:, None, :]
+    first, second = (project_distribution(twins[:, twin], atoms, rewards, discounts) for twin in range(2))
+    targets = critics.bellman_target(features, actions, rewards, discounts)
+    th.testing.assert_close(targets, th.minimum(first, second))
+    assert (targets.sum(dim=-1) < 0.999).all()
+    p, t = twins.double(), targets.double()[:, None]
+    expected = -(t * p.log() + (1 - t) * (1 - p).log()).sum(dim=-1).mean(dim=2).sum(dim=1)
+    th.testing.assert_close(critics.loss(features, actions, targets).double(), expected, rtol=1e-4, atol=1e-4)
+
+
 def test_values_start_near_zero():
     critics = ModeCritics(4, 2, [64, 64], n_groups=3, support=(0.0, 5.0), exploration_support=(-5.0, 5.0))
     values = critics.values(critics(th.randn(3, 100, 4), th.rand(3, 100, 2)))
