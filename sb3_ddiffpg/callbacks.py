@@ -1,6 +1,10 @@
-"""When to re-cluster."""
+"""When to re-cluster, and what evaluation during training shows of the modes."""
 
-from stable_baselines3.common.callbacks import BaseCallback
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv
 
 
 class ClusteringCallback(BaseCallback):
@@ -42,3 +46,38 @@ class ClusteringCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
+
+
+def contains_clustering(callback: BaseCallback) -> bool:
+    """
+    :param callback: A callback, perhaps with others inside
+    :return: Whether one of them is a ``ClusteringCallback``
+    """
+    if isinstance(callback, ClusteringCallback):
+        return True
+    children = getattr(callback, "callbacks", []) or [getattr(callback, "callback", None)]
+    return any(contains_clustering(child) for child in children if isinstance(child, BaseCallback))
+
+
+class ModeEvalCallback(EvalCallback):
+    """
+    SB3's ``EvalCallback``, which also logs ``eval/n_modes``: the number of different ground-truth labels (``info["mode"]``)
+    among the episodes that reached the goal. It is as lucky as their number is small; start the episodes from one place.
+
+    :param eval_env: The environment used for evaluation
+    :param kwargs: Further arguments of ``EvalCallback``; ``deterministic`` is False unless given
+    """
+
+    def __init__(self, eval_env: gym.Env | VecEnv, **kwargs: Any) -> None:
+        super().__init__(eval_env, **{"deterministic": False, **kwargs})
+        self._labels: set[Any] = set()
+
+    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        if not self._is_success_buffer:  # emptied at the beginning of each evaluation
+            self._labels = set()
+        super()._log_success_callback(locals_, globals_)
+        info = locals_["info"]
+        if locals_["done"] and "mode" in info:
+            if info.get("is_success") and info["mode"] is not None:
+                self._labels.add(info["mode"])
+            self.logger.record("eval/n_modes", len(self._labels))

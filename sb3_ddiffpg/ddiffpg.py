@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, Behavior
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
-from sb3_ddiffpg.callbacks import ClusteringCallback
+from sb3_ddiffpg.callbacks import ClusteringCallback, contains_clustering
 from sb3_ddiffpg.clustering import cluster
 from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.features import declared_mode_features, same_selection
@@ -714,7 +714,7 @@ class DDiffPG(OffPolicyAlgorithm):
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         callbacks = callback if isinstance(callback, list) else [callback]
         callbacks = [each if isinstance(each, BaseCallback) else ConvertCallback(each) for each in callbacks]
-        if not any(_contains_clustering(each) for each in callbacks):
+        if not any(contains_clustering(each) for each in callbacks):
             # First, so that the others see fresh modes
             callbacks.insert(0, ClusteringCallback())
         return super()._init_callback(callbacks, progress_bar)
@@ -797,10 +797,3 @@ class DDiffPG(OffPolicyAlgorithm):
             loaded.renumber_modes([names.index(name) if name in names else NO_MODE for name in loaded.owner[1]], len(names))
         if truncate_last_traj:
             self._last_obs = None
-
-
-def _contains_clustering(callback: BaseCallback) -> bool:
-    if isinstance(callback, ClusteringCallback):
-        return True
-    children = getattr(callback, "callbacks", []) or [getattr(callback, "callback", None)]
-    return any(_contains_clustering(child) for child in children if isinstance(child, BaseCallback))

@@ -23,12 +23,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_ddiffpg.callbacks import ModeEvalCallback
 from sb3_ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import make_vec_env
 
 try:
     import optuna
     import rl_zoo3.enjoy
+    import rl_zoo3.exp_manager
     import rl_zoo3.train
     from rl_zoo3.exp_manager import ExperimentManager
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
@@ -65,6 +67,7 @@ def register() -> None:
     HYPERPARAMS_SAMPLER[ALGO] = sample_ddiffpg_params
     HYPERPARAMS_CONVERTER[ALGO] = convert_ddiffpg_params
     rl_zoo3.train.ExperimentManager = ModeExperimentManager  # type: ignore[misc]
+    rl_zoo3.exp_manager.EvalCallback = ModeEvalCallback  # type: ignore[misc, assignment]
 
 
 def config_file(algo: str) -> Path | None:
@@ -239,7 +242,7 @@ def train(arguments: Sequence[str]) -> None:
     :param arguments: Command line, without the name of the program
     """
     parser = _parser()
-    parser.add_argument("--n-envs")
+    parser.add_argument("--n-envs", type=int)
     parser.add_argument("-params", "--hyperparams", nargs="+", default=[])
     known, rest = _read(parser, arguments)
     hyperparams = [*known.hyperparams, *([] if known.n_envs is None else [f"n_envs:{known.n_envs}"])]

@@ -5,8 +5,10 @@ import pytest
 from environments import WIDE, AnySpaces, TwoEnds, small_model
 from gymnasium import spaces
 from maze_routes import ROUTES
+from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_ddiffpg import ModeEvalCallback
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.evaluation import run_episodes
 from sb3_ddiffpg.plots import plot_routes
@@ -76,6 +78,49 @@ def test_paths_are_in_metres_behind_a_normalising_wrapper():
     for episode, same in zip(run_episodes(Unnormalising(), normalised, 4, mode="above"), expected, strict=True):
         np.testing.assert_allclose(episode.path, same.path, atol=1e-4)
         assert episode.episode_return == same.episode_return == 1.0
+
+
+class Labelled(TwoEnds):
+    """Says at an episode's end which end it was; the left one only counts as one mode more if it is reached."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, terminated, truncated, {**info, "mode": "left" if self.x < 0 else "right"}
+
+
+def test_evaluation_during_training_counts_modes():
+    """Against SB3's own counts, and the labels as they go by."""
+    logged, ended = [], []
+
+    class Watched(Labelled):
+        def step(self, action):
+            *rest, terminated, truncated, info = super().step(action)
+            if terminated or truncated:
+                ended.append(info["mode"] if terminated else None)
+            return *rest, terminated, truncated, info
+
+    class Recorder(KVWriter):
+        def write(self, key_values, key_excluded, step=0):
+            if "eval/n_modes" in key_values:
+                logged.append((key_values["eval/n_modes"], key_values["eval/success_rate"], list(ended)))
+                ended.clear()
+
+        def close(self):
+            pass
+
+    model = small_model(DummyVecEnv([TwoEnds] * 4))
+    model.set_logger(Logger(None, [Recorder()]))
+    callback = ModeEvalCallback(DummyVecEnv([Watched]), eval_freq=10, n_eval_episodes=3, verbose=0, warn=False)
+    assert not callback.deterministic
+    model.learn(400, callback=callback)
+    assert len(logged) == 10 and len({n_modes for n_modes, _, _ in logged}) > 1
+    for n_modes, success_rate, labels in logged:
+        assert len(labels) == 3 and n_modes == len(set(labels) - {None})
+        assert success_rate == pytest.approx(np.mean([label is not None for label in labels]))
+    # Where nobody says, nothing is counted
+    silent = ModeEvalCallback(DummyVecEnv([TwoEnds]), eval_freq=20, n_eval_episodes=2, verbose=0, warn=False)
+    model.learn(100, callback=silent)
+    assert len(logged) == 10
 
 
 @pytest.mark.parametrize(("success_key", "said"), [("solved", True), (None, None)])

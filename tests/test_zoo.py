@@ -16,6 +16,7 @@ import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.vec_env import VecMonitor
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn, optim
 
 from sb3_ddiffpg import DDiffPG, zoo
@@ -62,7 +63,9 @@ def train(folder, *options, **changes):
 def test_training_leaves_what_the_zoo_looks_for(logs, run):
     expected = {"best_model.zip", "evaluations.npz", "replay_buffer.pkl", f"{ENV}.zip"}
     assert expected | {"rl_model_400_steps.zip", "rl_model_800_steps.zip"} <= {path.name for path in run.iterdir()}
-    assert list((logs / "tb").rglob("events.out.tfevents*"))
+    (events,) = (logs / "tb").rglob("events.out.tfevents*")
+    tags = EventAccumulator(str(events)).Reload().Tags()["scalars"]
+    assert {"eval/n_modes", "eval/success_rate", "modes/n_modes", "train/target_action_shift", "time/recluster"} <= set(tags)
     # --n-envs joins --hyperparams instead of replacing it
     config = yaml.unsafe_load((run / ENV / "config.yml").read_text())
     assert config["n_envs"] == 4 and config["learning_starts"] == 100
