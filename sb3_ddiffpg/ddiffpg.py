@@ -522,8 +522,6 @@ class DDiffPG(OffPolicyAlgorithm):
             self.mode_trials,
             births=self._exploration_share() > 0,
         )
-        if found is None:
-            return []
         parents, kept = found.inheritance.parents, found.inheritance.kept
         self.replay_buffer.assign_modes(
             found.successes, found.labels, found.failures, found.failure_labels, parents, found.abandoned

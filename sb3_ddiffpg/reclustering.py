@@ -1,7 +1,7 @@
 """Mode discovery over the buffer's trajectories (algorithm 2 of the paper): clusters, heritage and the failures' modes."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,7 +60,7 @@ def find_modes(
     patience: int,
     trials: int,
     births: bool,
-) -> Reclustering | None:
+) -> Reclustering:
     """
     :param buffer: Holds the trajectories
     :param modes: The modes so far
@@ -70,7 +70,7 @@ def find_modes(
     :param patience: Re-clusterings in a row that must find a mode within another before it is merged
     :param trials: Commanded episodes in a row that must miss a mode's route before it is given up
     :param births: Whether modes may be born; the first always may
-    :return: The new modes, or None when nothing could take the place of the old ones
+    :return: The new modes
     """
     given_up = _given_up(modes, trials) if buffer.has_success_signal else []
     found, failures = _trajectories(buffer, {mode.name for index, mode in enumerate(modes) if index not in given_up})
@@ -81,40 +81,43 @@ def find_modes(
     if len(successes) >= min_size:
         distances = buffer.success_distances(successes)
         labels = cluster(distances)
-    n_new = int(labels.max(initial=NO_MODE)) + 1
-    if n_new == 0 and modes:
-        return None
+
     rng = np.random.RandomState(np.random.randint(2**31))
     dormant = _dormant(found, len(modes))
     old_labels = _old_labels(buffer, successes, modes, dormant, rng)
     labels = _defend(modes, distances, old_labels, labels, patience, max_modes)
     if modes and not births:
         labels = _without_births(old_labels, labels, len(modes))
-    n_new = int(labels.max(initial=NO_MODE)) + 1
-    inheritance = _with_dormant(match_modes(old_labels, labels, len(modes), n_new), dormant, max_modes)
-    heirs = {parent: new for new, parent in enumerate(inheritance.parents) if inheritance.kept[new] and parent is not None}
-    told = {mode.name: heirs[old] for old, mode in enumerate(modes) if old in heirs}
+    inheritance = _with_dormant(match_modes(old_labels, labels, len(modes), _count(labels)), dormant, max_modes)
+
+    told = {modes[old].name: new for new, old in enumerate(inheritance.parents) if old is not None and inheritance.kept[new]}
     for trajectory, label in zip(successes, labels.tolist(), strict=True):
         if trajectory.mode == NO_MODE and label != NO_MODE and told.get(trajectory.commanded or "") == label:
             modes[inheritance.parents[label]].misses = 0
+    failure_labels = _share_out(buffer, failures, successes, labels, told, rng)
+    found_modes = Reclustering(successes, labels, distances, failures, failure_labels, abandoned, inheritance)
+    return _foreign_apart(buffer, found_modes, told) if buffer.has_success_signal else found_modes
+
+
+def _count(labels: np.ndarray) -> int:
+    return int(labels.max(initial=NO_MODE)) + 1
+
+
+def _share_out(
+    buffer: ModeReplayBuffer,
+    failures: list[Trajectory],
+    successes: list[Trajectory],
+    labels: np.ndarray,
+    told: dict[str, int],
+    rng: np.random.RandomState,
+) -> np.ndarray:
+    """New mode of every failure. A mode must see its own; those of nobody are shared out by likeness, as in the paper."""
     failure_labels = np.array([told.get(failure.commanded or "", NO_MODE) for failure in failures], dtype=int)
-    # A mode must see its own failures; those that no mode answers for are shared out by likeness, as in the paper
     strayed = np.flatnonzero([failure.commanded not in told and not failure.foreign for failure in failures])
-    if n_new and len(strayed):
-        members = [[buffer.path(successes[i]) for i in np.flatnonzero(labels == mode)] for mode in range(n_new)]
+    if _count(labels) and len(strayed):
+        members = [[buffer.path(successes[i]) for i in np.flatnonzero(labels == mode)] for mode in range(_count(labels))]
         failure_labels[strayed] = assign_to_nearest([buffer.path(failures[i]) for i in strayed], members, rng)
-    if buffer.has_success_signal:
-        foreign = _foreign(told, successes, labels, set(heirs.values()))
-        for i, mode in foreign.items():
-            buffer.mark_off_route(successes[i], [successes[j] for j in np.flatnonzero(labels == mode)])
-        failures = [*failures, *(successes[i] for i in foreign)]
-        failure_labels = np.concatenate((failure_labels, list(foreign.values()))).astype(int)
-        order = np.argsort([failure.serial for failure in failures])
-        failures, failure_labels = [failures[i] for i in order], failure_labels[order]
-        own = np.array([i not in foreign for i in range(len(successes))], dtype=bool)
-        successes = [trajectory for trajectory, is_own in zip(successes, own, strict=True) if is_own]
-        labels, distances = labels[own], distances[np.ix_(own, own)]
-    return Reclustering(successes, labels, distances, failures, failure_labels, abandoned, inheritance)
+    return failure_labels
 
 
 def _defend(
@@ -132,7 +135,7 @@ def _defend(
 
     A new trajectory in a cluster of which a part is defended goes to the mode of its nearest old one.
     """
-    n_new = int(labels.max(initial=NO_MODE)) + 1
+    n_new = _count(labels)
     inheritance = match_modes(old_labels, labels, len(modes), n_new)
     labels = labels.copy()
     for old in sorted([*inheritance.merged, *inheritance.retired]):
@@ -174,8 +177,7 @@ def _without_births(old_labels: np.ndarray, labels: np.ndarray, n_old: int) -> n
     Labels without clusters that continue no mode: a part of a mode goes back to it, the rest are outliers. A mode that is
     born when exploration is over would have too little time to learn.
     """
-    n_new = int(labels.max(initial=NO_MODE)) + 1
-    inheritance = match_modes(old_labels, labels, n_old, n_new)
+    inheritance = match_modes(old_labels, labels, n_old, _count(labels))
     heirs = {parent: new for new, parent in enumerate(inheritance.parents) if inheritance.kept[new]}
     goes_to = np.array([heirs.get(parent, NO_MODE) for parent in inheritance.parents] + [NO_MODE])  # the last for NO_MODE
     labels = goes_to[labels]
@@ -183,21 +185,35 @@ def _without_births(old_labels: np.ndarray, labels: np.ndarray, n_old: int) -> n
     return labels
 
 
-def _foreign(told: dict[str, int], successes: list[Trajectory], labels: np.ndarray, established: set[int]) -> dict[int, int]:
+def _foreign_apart(buffer: ModeReplayBuffer, found: Reclustering, told: dict[str, int]) -> Reclustering:
     """
-    The new trajectories that were told to follow one mode, but took the route of another: their index, and the mode that
-    they were told to follow. Seen as successes they would tell its critic that any route will do, and the policy of a
-    longer route would drift to the shorter one beside it; unseen they would tell it nothing. So it sees them as failures.
+    The new trajectories that were told to follow one mode, but took the route of another, made failures of the first. Seen as
+    successes they would tell its critic that any route will do, and the policy of a longer route would drift to the
+    shorter one beside it; unseen they would tell it nothing.
 
     Those on the route of no mode so far have discovered one. They stay with it, or it would be born without trajectories.
     """
+    successes, labels = found.successes, found.labels
+    established = {new for new, is_kept in enumerate(found.inheritance.kept) if is_kept}
     foreign: dict[int, int] = {}
     for i, trajectory in enumerate(successes):
         mode = told.get(trajectory.commanded or "", NO_MODE)
         has_route = mode != NO_MODE and mode in labels  # a dormant mode has none yet that one could leave
         if trajectory.mode == NO_MODE and has_route and labels[i] in established - {mode}:
             foreign[i] = mode
-    return foreign
+            buffer.mark_off_route(trajectory, [successes[j] for j in np.flatnonzero(labels == mode)])
+    failures = [*found.failures, *(successes[i] for i in foreign)]
+    failure_labels = np.concatenate((found.failure_labels, list(foreign.values()))).astype(int)
+    order = np.argsort([failure.serial for failure in failures])
+    own = np.array([i for i in range(len(successes)) if i not in foreign], dtype=int)
+    return replace(
+        found,
+        successes=[successes[i] for i in own],
+        labels=labels[own],
+        distances=found.distances[np.ix_(own, own)],
+        failures=[failures[i] for i in order],
+        failure_labels=failure_labels[order],
+    )
 
 
 def _dormant(successes: list[Trajectory], n_modes: int) -> list[int]:
