@@ -23,7 +23,7 @@ class ModeBatch(NamedTuple):
 
     Observations are [N, ...] (or dicts of such), ``actions``, ``target_actions`` [G, n, action_dim], ``rewards`` and
     ``discounts`` [G, n]. ``active`` [G] is False for a mode without any transition, whose rows are a stand-in that must
-    not train it. ``imitated`` [G, n] is False for these and for steps off the mode's route, which the policy must not learn.
+    not train it. ``imitated`` [G, n] is False for these and for steps of foreign trajectories, which the policy must not learn.
     ``rows`` [G, n] and ``windows`` [G, n, n_steps] (-1 where a window ends early, or beyond the mode's route) say where in the
     buffer the transitions lie.
     """
@@ -139,13 +139,14 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.mode_rows: list[RowSet] = []
 
     def _row_arrays(self) -> list[str]:
-        own = ["target_actions", "exploratory_target_actions", "off_route", "_mode_position"]
+        own = ["target_actions", "exploratory_target_actions", "foreign", "off_route", "_mode_position"]
         return [*super()._row_arrays(), *own]
 
     def _allocate(self) -> None:
         super()._allocate()
         self.target_actions = np.zeros_like(self.actions)
         self.exploratory_target_actions = np.zeros_like(self.actions)
+        self.foreign = np.zeros(self.buffer_size, dtype=bool)
         self.off_route = np.zeros(self.buffer_size, dtype=bool)
         self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
         for row_set in self.mode_rows:
@@ -154,7 +155,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     def _write_rows(self, rows: np.ndarray, obs: Any, next_obs: Any, action: np.ndarray, *args: Any) -> None:
         super()._write_rows(rows, obs, next_obs, action, *args)
         self.target_actions[rows] = self.exploratory_target_actions[rows] = action
-        self.off_route[rows] = False
+        self.foreign[rows] = self.off_route[rows] = False
 
     def _evict(self) -> Trajectory:
         trajectory = super()._evict()
@@ -321,6 +322,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param members: Goal-reached trajectories of that mode
         """
         trajectory.foreign = True
+        self.foreign[trajectory.rows] = True
         route = np.concatenate([self.path(member) for member in members])
         reached = self.full_path(trajectory)[1:] / self._feature_scale
         extent = float(np.linalg.norm(np.ptp(route, axis=0)))
@@ -333,7 +335,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         """
         :param trajectory: A foreign trajectory whose mode has ended: it is a success like any other again
         """
-        self.off_route[trajectory.rows] = False
+        self.foreign[trajectory.rows] = self.off_route[trajectory.rows] = False
         trajectory.foreign, trajectory.commanded, trajectory.mode = False, None, NO_MODE
 
     def _change_mode(self, trajectory: Trajectory, mode: int, parents: list[int | None]) -> None:
@@ -372,8 +374,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         # For its mode a step off the route ends the episode without reward, so that no way back is worth anything
         lost = np.logical_or.accumulate(self.off_route[windows] & present, axis=-1)
         lost[EXPLORATORY] = False
-        # There no action is better than another: the target action would stay what led away
-        imitated = active[:, None] & ~lost[..., 0]
+        # What led away from the route is for the critic to judge, not for the policy to follow
+        imitated = active[:, None] & ~self.foreign[rows]
+        imitated[EXPLORATORY] = True
         rewards = (np.where(present & ~lost, rewards, 0.0) * powers).sum(axis=-1)  # [G, n]
         lengths = present.sum(axis=-1)
         last = np.take_along_axis(windows, lengths[..., None] - 1, axis=-1)[..., 0]

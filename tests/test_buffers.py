@@ -457,7 +457,7 @@ def test_another_goal_beside_the_route_is_off_it():
         buffer.mark_off_route(trajectory, members)
         assert trajectory.foreign and buffer.off_route[trajectory.rows].tolist() == off_route
     buffer.readmit(elsewhere)
-    assert not elsewhere.foreign and not buffer.off_route[elsewhere.rows].any()
+    assert not elsewhere.foreign and not (buffer.off_route | buffer.foreign)[elsewhere.rows].any()
 
 
 def test_intrinsic_rewards_end_where_the_route_does():

@@ -101,18 +101,18 @@ def test_groups_without_data_train_nothing(tmp_path):
     assert not np.array_equal(model.replay_buffer.exploratory_target_actions, buffer.exploratory_target_actions)
 
 
-def test_the_policy_does_not_imitate_steps_off_the_route():
+def test_the_policy_does_not_imitate_foreign_trajectories():
     """For the mode only: to the exploratory group all steps are alike."""
     model = trained_model()
     buffer = model.replay_buffer
-    buffer.off_route[: buffer.pos : 3] = True
+    buffer.foreign[: buffer.pos : 3] = True
     batch = draw(model)
-    off_route = buffer.off_route[batch.rows]
-    assert off_route.any(axis=1).all()
-    off_route[0] = False
-    np.testing.assert_array_equal(batch.imitated.numpy(), ~off_route)
+    foreign = buffer.foreign[batch.rows]
+    assert foreign.any(axis=1).all()
+    foreign[0] = False
+    np.testing.assert_array_equal(batch.imitated.numpy(), ~foreign)
     start, updated = deepcopy(model.get_parameters()), []
-    for changed in (np.zeros_like(off_route), off_route, ~off_route):
+    for changed in (np.zeros_like(foreign), foreign, ~foreign):
         model.set_parameters(start)
         th.manual_seed(0)
         model._update_actor(batch, th.where(th.as_tensor(changed)[..., None], -batch.target_actions, batch.target_actions))
