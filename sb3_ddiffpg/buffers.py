@@ -23,9 +23,9 @@ class ModeBatch(NamedTuple):
 
     Observations are [N, ...] (or dicts of such), ``actions``, ``target_actions`` [G, n, action_dim], ``rewards`` and
     ``discounts`` [G, n]. ``active`` [G] is False for a mode without any transition, whose rows are a stand-in that must
-    not train it. ``imitated`` [G, n] is False for these and for steps of foreign trajectories, which the policy must not learn.
-    ``rows`` [G, n] and ``windows`` [G, n, n_steps] (-1 where a window ends early, or beyond the mode's route) say where in the
-    buffer the transitions lie.
+    not train it. ``imitated`` [G, n] is False for these and for steps of foreign trajectories, which the policy must not
+    learn. ``rows`` [G, n] and ``windows`` [G, n, n_steps] (-1 where a window ends early, or beyond the mode's route) say where
+    in the buffer the transitions lie.
     """
 
     observations: Any

@@ -32,7 +32,7 @@ class PlainBuffer:
         self.size, self.limits = size, {True: max_successes, False: max_failures}
         self.running = [[] for _ in range(n_envs)]
         self.episodes = []
-        self.n_modes = self.n_finished = 0
+        self.n_modes = self.n_finished = self.n_retired = 0
 
     def steps(self):
         return [step for episode in [e["steps"] for e in self.episodes] + self.running for step in episode]
@@ -78,7 +78,6 @@ class PlainBuffer:
 
     def assign(self, success_modes, failure_modes, parents):
         retiring = []
-        n_retired = sum(episode["retired"] is not None for episode in self.episodes)
         for success, modes in ((True, success_modes), (False, failure_modes)):
             limit, members = self.limits[success], defaultdict(list)
             for episode, mode in zip(self.active(success), modes, strict=True):
@@ -96,8 +95,9 @@ class PlainBuffer:
                     episode["trains"] = episode in direct[-limit:]
                 retiring += [*direct[:-limit], *detours[:-limit]]
         self.n_modes = len(parents)
-        for order, episode in enumerate(sorted(retiring, key=lambda episode: episode["serial"])):
-            episode.update(mode=NO_MODE, retired=(self.n_finished, n_retired + order))
+        for episode in sorted(retiring, key=lambda episode: episode["serial"]):
+            episode.update(mode=NO_MODE, retired=self.n_retired)
+            self.n_retired += 1
 
     def direct(self, episodes):
         """At most half as long again as the shortest, and the five shortest in any case."""
