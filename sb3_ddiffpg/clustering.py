@@ -29,7 +29,7 @@ __all__ = [
 LINKAGES = ("average", "complete", "single", "weighted")
 
 # Mean silhouette that makes a group a mode. On synthetic routes, narrow and wide, alone and beside others, every value from
-# .52 to .6 gives the true partition in 240 of 240 cases; lower ones split a route, higher ones join two.
+# .52 to .6 gives the true partition in 240 of 240 cases (slow tests); lower ones split a route, higher ones join two.
 _CLEAR_SILHOUETTE = 0.55
 
 # Cuts tried per branch, from the top: what lies lower is found when the branches are looked into themselves.

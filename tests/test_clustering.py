@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import pdist, squareform
 
+from sb3_ddiffpg import clustering
 from sb3_ddiffpg.clustering import (
     LINKAGES,
     Inheritance,
@@ -233,6 +234,29 @@ def test_routes_are_told_apart(routes, counts, deviation, resampled):
         if resampled:
             paths = [resample_path(path, 48) for path in paths]
         assert same_partition(cluster(dtw_distances(paths), None), truth)
+
+
+ROUTES_AND_COUNTS = [
+    *((routes[:1], [n]) for routes, n in ((ONE_BLOCK, 20), (FOUR_WAYS, 30), (FIVE_WAYS, 40))),
+    *((ONE_BLOCK, counts) for counts in ([20, 20], [40, 5])),
+    *((FIVE_WAYS, counts) for counts in ([8] * 5, [40, 5, 5, 10, 10])),
+    (TWO_GOALS, [20, 20]),
+    (FOUR_WAYS, [10] * 4),
+    (NESTED, [10, 10, 10, 5]),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("silhouette", [0.52, 0.55, 0.6])
+@pytest.mark.parametrize("deviation", [0.2, 0.5, 0.8])
+def test_the_automatic_rule_does_not_stand_on_an_edge(silhouette, deviation, monkeypatch):
+    """It is right in all of 240 cases, and would be with a silhouette a little smaller or larger."""
+    monkeypatch.setattr(clustering, "_CLEAR_SILHOUETTE", silhouette)
+    for routes, counts in ROUTES_AND_COUNTS:
+        for seed in range(10, 18):
+            paths, truth = runs(np.random.default_rng(seed), routes, counts, deviation)
+            distances = dtw_distances([resample_path(path, 48) for path in paths])
+            assert same_partition(cluster(distances, None, min_size=5), truth)
 
 
 def test_wanderers_are_neither_a_mode_nor_in_the_way():
