@@ -28,11 +28,12 @@ from sb3_ddiffpg.callbacks import ClusteringCallback, contains_clustering
 from sb3_ddiffpg.clustering import cluster
 from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.features import declared_mode_features, same_selection
+from sb3_ddiffpg.interrupts import uninterrupted
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, noveld_reward
 from sb3_ddiffpg.modes import Mode, ModeTable, succeed
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
 from sb3_ddiffpg.policies import DiffusionActor, DiffusionPolicy
-from sb3_ddiffpg.reclustering import find_modes
+from sb3_ddiffpg.reclustering import Reclustering, find_modes
 from sb3_ddiffpg.target_actions import ascend
 from sb3_ddiffpg.trajectories import NO_MODE, Trajectory
 from sb3_ddiffpg.validation import check_arguments
@@ -522,6 +523,18 @@ class DDiffPG(OffPolicyAlgorithm):
             self.mode_trials,
             births=self._exploration_share() > 0,
         )
+        with uninterrupted():
+            events = self._replace_modes(found)
+        found.describe(self._modes, self.replay_buffer)
+        self.logger.record("modes/n_modes", len(self._modes))
+        for mode in self._modes:
+            self.logger.record(f"modes/{mode.name}/n_trajectories", mode.n_trajectories)
+            self.logger.record(f"modes/{mode.name}/success_rate", mode.success_rate)
+        self.logger.record("time/recluster", time.perf_counter() - started)
+        return events
+
+    def _replace_modes(self, found: Reclustering) -> list[str]:
+        """Let buffer, policy, table and environments follow a re-clustering; what became of the modes."""
         parents, kept = found.inheritance.parents, found.inheritance.kept
         self.replay_buffer.assign_modes(
             found.successes, found.labels, found.failures, found.failure_labels, parents, found.abandoned
@@ -533,12 +546,6 @@ class DDiffPG(OffPolicyAlgorithm):
         )
         names = [mode.name for mode in self._modes]
         self._behavior.follow([names.index(name) if name in names else None for name in old_names])
-        found.describe(self._modes, self.replay_buffer)
-        self.logger.record("modes/n_modes", len(self._modes))
-        for mode in self._modes:
-            self.logger.record(f"modes/{mode.name}/n_trajectories", mode.n_trajectories)
-            self.logger.record(f"modes/{mode.name}/success_rate", mode.success_rate)
-        self.logger.record("time/recluster", time.perf_counter() - started)
         return events
 
     def _cluster(self, distances: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The modes of a model: how they are commanded and shown, and that each keeps its name and belongings for life."""
 
+import signal
 from collections import Counter
 from copy import deepcopy
 
@@ -435,6 +436,24 @@ def test_statistics_and_representative(two_routes):
         assert mode.mean_return == pytest.approx(np.mean([t.episode_return for t in members]))
         distances = buffer.success_distances(members).mean(axis=1)
         np.testing.assert_array_equal(mode.representative, buffer.full_path(members[distances.argmin()]))
+
+
+def test_an_interrupt_waits_until_all_follow_the_clustering(two_routes, monkeypatch):
+    model = two_routes
+    walk(model, "right", 9)
+    inherit = model.policy.inherit
+
+    def interrupted(*args):
+        signal.raise_signal(signal.SIGINT)
+        inherit(*args)
+
+    monkeypatch.setattr(model.policy, "inherit", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        model.recluster()
+    monkeypatch.undo()
+    assert len(model.modes) == model.policy.n_modes == len(model.replay_buffer.mode_rows) == 3
+    model.train(1, 32)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_max_modes():
