@@ -5,6 +5,7 @@ from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.env_util import make_vec_env as make_sb3_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
@@ -24,22 +25,35 @@ __all__ = [
     "reduce_word",
 ]
 
-_POINT_MAZE = "sb3_ddiffpg.envs.point:PointMazeEnv"
+# Single environment -> the class that steps many of them together. Strings, so that simulators are imported when needed
+_VEC_ENVS = {
+    "sb3_ddiffpg.envs.point:PointMazeEnv": "sb3_ddiffpg.envs.point:PointMazeVecEnv",
+    "sb3_ddiffpg.envs.ant:AntMazeEnv": "sb3_ddiffpg.envs.ant:AntMazeVecEnv",
+}
+_POINT_MAZE, _ANT_MAZE = _VEC_ENVS
 
 for _name in MAZES:
+    _ant_limit = 500 if _name in ("V1", "V2") else 700
     gym.register(f"PointMaze{_name}-v0", entry_point=_POINT_MAZE, max_episode_steps=150, kwargs={"maze_map": _name})
+    gym.register(f"AntMaze{_name}-v0", entry_point=_ANT_MAZE, max_episode_steps=_ant_limit, kwargs={"maze_map": _name})
+_random: dict[str, Any] = {"maze_map": "V3", "n_blocked": 2}
+gym.register("PointMazeRandom-v0", entry_point=_POINT_MAZE, max_episode_steps=150, kwargs=_random)
+gym.register("AntMazeRandom-v0", entry_point=_ANT_MAZE, max_episode_steps=700, kwargs=_random)
 
 
-def make_vec_env(env_id: str, n_envs: int = 1, seed: int | None = None, **env_kwargs: Any) -> VecEnv:
+def make_vec_env(
+    env_id: str, n_envs: int = 1, seed: int | None = None, n_threads: int | None = None, **env_kwargs: Any
+) -> VecEnv:
     """
     Many environments as SB3 wants them: in one process, with ``info["episode"]`` at the end of each episode.
 
-    The point mazes are stepped together as a :class:`PointMazeVecEnv`; for every other id this is SB3's
+    The mazes are stepped together as a :class:`~sb3_ddiffpg.envs.maze_env.MazeVecEnv`; for every other id this is SB3's
     ``make_vec_env``. Both give the same numbers.
 
     :param env_id: id of a registered environment, perhaps with the module that registers it: ``"module:id"``
     :param n_envs: number of environments
     :param seed: environment i is seeded with ``seed + i`` at the first reset
+    :param n_threads: threads of the simulator, where it has any; None: its own choice
     :param env_kwargs: arguments of ``gym.make``, such as ``max_episode_steps`` or ``maze_map``
     :return: the vectorised environment, with monitor
     """
@@ -47,13 +61,15 @@ def make_vec_env(env_id: str, n_envs: int = 1, seed: int | None = None, **env_kw
     if module:
         import_module(module)
     spec = gym.spec(name)
-    if spec.entry_point != _POINT_MAZE:
+    if spec.entry_point not in _VEC_ENVS:
         return make_sb3_vec_env(env_id, n_envs, seed=seed, env_kwargs=env_kwargs)
     limit = env_kwargs.pop("max_episode_steps", spec.max_episode_steps)
     kwargs = {"render_mode": "rgb_array", **spec.kwargs, **env_kwargs}
-    point_mazes = PointMazeVecEnv(n_envs, max_episode_steps=limit, **kwargs)
-    point_mazes.spec = replace(spec, max_episode_steps=limit, kwargs=kwargs)
+    threads = {} if n_threads is None or spec.entry_point == _POINT_MAZE else {"n_threads": n_threads}
+    make: Any = load_env_creator(_VEC_ENVS[spec.entry_point])
+    mazes = make(n_envs, max_episode_steps=limit, **kwargs, **threads)
+    mazes.spec = replace(spec, max_episode_steps=limit, kwargs=kwargs)
     if seed is not None:
-        point_mazes.action_space.seed(seed)
-    point_mazes.seed(seed)
-    return VecMonitor(point_mazes)
+        mazes.action_space.seed(seed)
+    mazes.seed(seed)
+    return VecMonitor(mazes)

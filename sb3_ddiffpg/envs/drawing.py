@@ -13,6 +13,7 @@ WALL = (58, 64, 74)
 FLOOR = (246, 244, 239)
 START = (168, 203, 240)
 GOAL = (92, 184, 112)
+OBSTACLE = (150, 104, 66)
 BODY = (214, 62, 44)
 OUTLINE = (20, 20, 20)
 
@@ -28,7 +29,7 @@ def draw_maze(maze: Maze, goal_radius: float) -> Image:
     side = round(CELL_SIZE * PIXELS_PER_METRE)
     walls = maze.walls.repeat(side, axis=0).repeat(side, axis=1)
     image = np.where(walls[..., None], WALL, FLOOR).astype(np.uint8)
-    _fill_square(image, maze, maze.start, 1.0, START)
+    fill_square(image, maze, maze.start, 1.0, START)
     x_min, _, _, y_max = maze.extent
     x = x_min + (np.arange(image.shape[1]) + 0.5) / PIXELS_PER_METRE
     y = y_max - (np.arange(image.shape[0]) + 0.5) / PIXELS_PER_METRE
@@ -46,11 +47,18 @@ def draw_body(image: Image, maze: Maze, position: FloatArray, half_size: float) 
     :param position: centre (x, y) of the body
     :param half_size: half its side, in metres
     """
-    _fill_square(image, maze, position, half_size, OUTLINE)
-    _fill_square(image, maze, position, half_size - 1 / PIXELS_PER_METRE, BODY)
+    fill_square(image, maze, position, half_size, OUTLINE)
+    fill_square(image, maze, position, half_size - 1 / PIXELS_PER_METRE, BODY)
 
 
-def _fill_square(image: Image, maze: Maze, center: FloatArray, half_size: float, color: tuple[int, int, int]) -> None:
+def fill_square(image: Image, maze: Maze, center: FloatArray, half_size: float, color: tuple[int, int, int]) -> None:
+    """
+    :param image: made by :func:`draw_maze`, changed in place
+    :param maze: the same maze
+    :param center: (x, y) of the square
+    :param half_size: half its side, in metres
+    :param color: red, green, blue
+    """
     x, y = center[0] - maze.extent[0], maze.extent[3] - center[1]
     left, right, top, bottom = (
         round(PIXELS_PER_METRE * edge) for edge in (x - half_size, x + half_size, y - half_size, y + half_size)

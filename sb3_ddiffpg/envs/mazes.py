@@ -221,6 +221,15 @@ class Maze:
         """Labels of the routes the paper counts in this maze; empty for a map of one's own."""
         return LISTED_ROUTES.get(self.name or "", ())
 
+    @property
+    def gap_cells(self) -> list[tuple[int, int]]:
+        """Open cells between two walls, one above and one below, in a column where an island has its cut: the ways past it."""
+        columns = {round((cut.x - self.extent[0]) / CELL_SIZE - 0.5) for cut in self.cuts}
+        middle = np.zeros_like(self.walls)
+        middle[1:-1] = ~self.walls[1:-1] & self.walls[:-2] & self.walls[2:]
+        taken = {self.start_cell, *self.goal_cells}
+        return [cell for cell in _cells_where(middle) if cell[1] in columns and cell not in taken]
+
     def cell_center(self, cell: tuple[int, int]) -> FloatArray:
         """
         :param cell: row and column
@@ -228,13 +237,16 @@ class Maze:
         """
         return CELL_SIZE * np.array([cell[1] - self.start_cell[1], self.start_cell[0] - cell[0]], dtype=np.float64)
 
-    def blocked(self, x: FloatArray, y: FloatArray, half_size: float) -> npt.NDArray[np.bool_]:
+    def blocked(
+        self, x: FloatArray, y: FloatArray, half_size: float, walls: npt.NDArray[np.bool_] | None = None
+    ) -> npt.NDArray[np.bool_]:
         """
         Whether square bodies overlap a wall, or lie outside the map.
 
         :param x: x of the centres, shape (n,)
         :param y: y of the centres, shape (n,)
         :param half_size: half the side of the bodies, at most half a cell
+        :param walls: wall cells of each body's own maze, shape (n, rows * columns); None: the map's
         :return: shape (n,)
         """
         n_rows, n_columns = self.walls.shape
@@ -242,7 +254,11 @@ class Maze:
         # No body is larger than a cell, so that a wall below it lies below one of its corners
         columns = ((x + (corners - self.extent[0])) * (1 / CELL_SIZE)).clip(0, n_columns - 1).astype(np.intp)
         rows = (((corners + self.extent[3]) - y) * (1 / CELL_SIZE)).clip(0, n_rows - 1).astype(np.intp)
-        hits = self._flat_walls.take((rows * n_columns)[:, None] + columns[None])
+        cells = (rows * n_columns)[:, None] + columns[None]  # (2, 2, n)
+        if walls is None:
+            hits = self._flat_walls.take(cells)
+        else:
+            hits = walls.ravel().take(cells + np.arange(len(walls)) * walls.shape[1])
         return hits[0, 0] | hits[0, 1] | hits[1, 0] | hits[1, 1]
 
     def is_open_box(self, low: npt.ArrayLike, high: npt.ArrayLike) -> bool:
