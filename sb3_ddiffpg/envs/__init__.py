@@ -39,6 +39,8 @@ for _name in MAZES:
 _random: dict[str, Any] = {"maze_map": "V3", "n_blocked": 2}
 gym.register("PointMazeRandom-v0", entry_point=_POINT_MAZE, max_episode_steps=150, kwargs=_random)
 gym.register("AntMazeRandom-v0", entry_point=_ANT_MAZE, max_episode_steps=700, kwargs=_random)
+for _name in ("Reach", "PegInHole", "DrawerClose"):
+    gym.register(f"Franka{_name}-v0", entry_point=f"sb3_ddiffpg.envs.franka.tasks:Franka{_name}", max_episode_steps=100)
 
 
 def make_vec_env(
