@@ -6,7 +6,9 @@ Only ratios carry over to another machine. Usage: ``python benchmarks/bench_envs
 """
 
 import argparse
+import contextlib
 import gc
+import os
 import resource
 import time
 from collections.abc import Callable
@@ -25,10 +27,22 @@ PAGE = resource.getpagesize()
 
 def resident() -> float:
     """
-    :return: memory held by this process, in MB; NaN where the system does not say
+    :return: memory held by this process and its children, in MB; NaN where the system does not say
     """
-    statm = Path("/proc/self/statm")
-    return int(statm.read_text().split()[1]) * PAGE / 1e6 if statm.exists() else float("nan")
+    if not Path("/proc/self/statm").exists():
+        return float("nan")
+    parents = {}
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it may have ended since
+            parents[int(status.parent.name)] = int(status.read_text().rpartition(")")[2].split()[1])
+    family = {os.getpid()}
+    while more := {child for child, parent in parents.items() if parent in family} - family:
+        family |= more
+    total = 0
+    for process in family:
+        with contextlib.suppress(OSError):
+            total += int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    return total * PAGE / 1e6
 
 
 def steps_per_second(env: VecEnv, seconds: float) -> float:
@@ -78,14 +92,25 @@ def main() -> None:
             (f"ant {integrator}, ours, 1 thread", lambda i=integrator: make_vec_env(ant, n, n_threads=1, integrator=i)),
             (f"ant {integrator}, ours, 2 threads", lambda i=integrator: make_vec_env(ant, n, n_threads=2, integrator=i)),
         ]
+    try:
+        import pybullet  # noqa: F401
+    except ImportError:
+        print("without pybullet: no arm")
+    else:
+        variants += [
+            ("arm, DummyVecEnv, 16", lambda: make_sb3_vec_env("FrankaDrawerClose-v0", 16)),
+            ("arm, ours, 1 worker", lambda: make_vec_env("FrankaDrawerClose-v0", 16, n_threads=1)),
+            ("arm, ours, 2 workers", lambda: make_vec_env("FrankaDrawerClose-v0", 16, n_threads=2)),
+        ]
     print(f"{'variant':<28} {'steps/s':>12} {'to DummyVecEnv':>15} {'MB':>7}")
     reference = float("nan")
     for name, make in variants:
         gc.collect()
         before = resident()
         env = make()
-        rate = steps_per_second(env, arguments.seconds)
+        env.reset()
         memory = resident() - before
+        rate = steps_per_second(env, arguments.seconds)
         if "DummyVecEnv" in name:
             reference = rate
         ratio = f"{rate / reference:14.1f}x" if "ours, " in name and not name.endswith(", 1") else " " * 15

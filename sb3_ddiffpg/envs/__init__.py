@@ -1,6 +1,7 @@
 """Environments with several ways to the goal. Importing this module registers them with gymnasium."""
 
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -11,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_ddiffpg.envs.mazes import LISTED_ROUTES, MAZES, HomotopyTracker, Maze, reduce_word
 from sb3_ddiffpg.envs.point import PointMazeEnv, PointMazeVecEnv
+from sb3_ddiffpg.envs.workers import WorkerVecEnv
 from sb3_ddiffpg.envs.wrappers import HideGoal
 
 __all__ = [
@@ -39,8 +41,9 @@ for _name in MAZES:
 _random: dict[str, Any] = {"maze_map": "V3", "n_blocked": 2}
 gym.register("PointMazeRandom-v0", entry_point=_POINT_MAZE, max_episode_steps=150, kwargs=_random)
 gym.register("AntMazeRandom-v0", entry_point=_ANT_MAZE, max_episode_steps=700, kwargs=_random)
+_FRANKA = "sb3_ddiffpg.envs.franka.tasks:Franka"
 for _name in ("Reach", "PegInHole", "DrawerClose"):
-    gym.register(f"Franka{_name}-v0", entry_point=f"sb3_ddiffpg.envs.franka.tasks:Franka{_name}", max_episode_steps=100)
+    gym.register(f"Franka{_name}-v0", entry_point=f"{_FRANKA}{_name}", max_episode_steps=100)
 
 
 def make_vec_env(
@@ -49,13 +52,14 @@ def make_vec_env(
     """
     Many environments as SB3 wants them: in one process, with ``info["episode"]`` at the end of each episode.
 
-    The mazes are stepped together as a :class:`~sb3_ddiffpg.envs.maze_env.MazeVecEnv`; for every other id this is SB3's
-    ``make_vec_env``. Both give the same numbers.
+    The mazes are stepped together as a :class:`~sb3_ddiffpg.envs.maze_env.MazeVecEnv`, the arm's tasks in a few processes
+    (:class:`~sb3_ddiffpg.envs.workers.WorkerVecEnv`); for every other id this is SB3's ``make_vec_env``. All give the numbers
+    of environments that are stepped one after the other.
 
     :param env_id: id of a registered environment, perhaps with the module that registers it: ``"module:id"``
     :param n_envs: number of environments
     :param seed: environment i is seeded with ``seed + i`` at the first reset
-    :param n_threads: threads of the simulator, where it has any; None: its own choice
+    :param n_threads: threads of the ants' simulator, processes of the arm's; None: one per processor
     :param env_kwargs: arguments of ``gym.make``, such as ``max_episode_steps`` or ``maze_map``
     :return: the vectorised environment, with monitor
     """
@@ -63,6 +67,12 @@ def make_vec_env(
     if module:
         import_module(module)
     spec = gym.spec(name)
+    if str(spec.entry_point).startswith(_FRANKA) and n_envs > 1:
+        workers = WorkerVecEnv([partial(gym.make, f"sb3_ddiffpg.envs:{name}", **env_kwargs)] * n_envs, n_threads)
+        if seed is not None:
+            workers.action_space.seed(seed)
+        workers.seed(seed)
+        return VecMonitor(workers)
     if spec.entry_point not in _VEC_ENVS:
         return make_sb3_vec_env(env_id, n_envs, seed=seed, env_kwargs=env_kwargs)
     limit = env_kwargs.pop("max_episode_steps", spec.max_episode_steps)

@@ -17,6 +17,7 @@ from sb3_ddiffpg.envs.drawing import Image
 from sb3_ddiffpg.envs.maze_env import MazeEnv, MazeVecEnv
 from sb3_ddiffpg.envs.maze_simulation import MazeSimulation
 from sb3_ddiffpg.envs.mazes import FloatArray, MazeMap
+from sb3_ddiffpg.envs.workers import n_processors
 
 #: Steps of the simulator in one step of the environment, which so takes 0.1 s.
 FRAME_SKIP = 5
@@ -62,7 +63,7 @@ class AntSimulation(MazeSimulation):
         if integrator not in INTEGRATORS:
             raise ValueError(f"integrator: {integrator!r} given; accepted are {', '.join(map(repr, INTEGRATORS))}")
         if n_threads is None:
-            n_threads = 0 if n == 1 else _n_processors()
+            n_threads = 0 if n == 1 else n_processors()
         if n_threads < 0:
             raise ValueError(f"n_threads: {n_threads} given; accepted are whole numbers from 0 up")
         if start_noise is None:
@@ -155,11 +156,6 @@ class AntSimulation(MazeSimulation):
         if self._viewer is not None:
             self._viewer.close()
             self._viewer = None
-
-
-def _n_processors() -> int:
-    """That this process may use, which can be fewer than the machine has."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _make_viewer(model: mujoco.MjModel) -> OffScreenViewer:

@@ -1,0 +1,256 @@
+"""Environments in a few worker processes, several in each, for simulators that step one environment at a time."""
+
+import multiprocessing
+import os
+import traceback
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+
+def n_processors() -> int:
+    """
+    :return: processors that this process may use, which can be fewer than the machine has
+    """
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _failing_env(error: BaseException) -> int:
+    """Which environment of a DummyVecEnv was at work when an error was raised; 0 if that cannot be told."""
+    frames = [frame.f_locals for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return next((int(variables["env_idx"]) for variables in frames if "env_idx" in variables), 0)
+
+
+def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper) -> None:
+    """What a worker does: it answers each command with ``("ok", result)`` or ``("error", (environment, text))``."""
+    parent.close()
+    envs: DummyVecEnv | None = None
+    while True:
+        try:
+            command, argument = remote.recv()
+        except (EOFError, KeyboardInterrupt):
+            break  # the parent is gone, or says what happens now
+        try:
+            if command == "make":
+                envs = DummyVecEnv(wrapped.var)
+                result: Any = (envs.observation_space, envs.action_space, envs.render_mode)
+            elif command == "close":
+                break
+            else:
+                result = _answer(envs, command, argument)
+            remote.send(("ok", result))
+        except Exception as error:
+            remote.send(("error", (_failing_env(error), traceback.format_exc())))
+    if envs is not None:
+        envs.close()
+    remote.close()
+
+
+def _answer(envs: Any, command: str, argument: Any) -> Any:
+    if command == "reset":
+        envs._seeds, envs._options = argument
+        return envs.reset(), envs.reset_infos
+    if command == "step":
+        return *envs.step(argument), envs.reset_infos
+    name, arguments, keywords = argument
+    return getattr(envs, name)(*arguments, **keywords)
+
+
+class WorkerVecEnv(VecEnv):
+    """
+    SB3's ``SubprocVecEnv`` with several environments in each process: one process for each of many environments costs more
+    memory than the environments, and time to tell each its action.
+
+    An environment that raises, and a worker that dies, end the run with an error that names the environment and the cause.
+
+    :param env_fns: functions that make the environments
+    :param n_workers: number of processes; None: one per processor that this process may use
+    :raises ValueError: if ``n_workers`` is less than 1
+    """
+
+    def __init__(self, env_fns: Sequence[Callable[[], gym.Env]], n_workers: int | None = None) -> None:
+        if n_workers is None:
+            n_workers = n_processors()
+        if n_workers < 1:
+            raise ValueError(f"n_workers: {n_workers} given; accepted are whole numbers from 1 up")
+        n_workers = min(n_workers, len(env_fns))
+        #: First environment of each worker, and the number of environments
+        self.first = np.linspace(0, len(env_fns), n_workers + 1).round().astype(int)
+        # Not fork: simulators and networks have threads by then
+        methods = multiprocessing.get_all_start_methods()
+        context: Any = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
+        self.remotes: list[Connection] = []
+        self.processes: list[Any] = []
+        self._closed = False
+        for first, last in zip(self.first[:-1], self.first[1:], strict=True):
+            remote, theirs = context.Pipe()
+            # A daemon, so that it does not outlive a crash of this process
+            process = context.Process(
+                target=_work, args=(theirs, remote, CloudpickleWrapper(list(env_fns[first:last]))), daemon=True
+            )
+            process.start()
+            theirs.close()
+            self.remotes.append(remote)
+            self.processes.append(process)
+        observation_space, action_space, self.render_mode = self._ask("make", [None] * n_workers)[0]
+        super().__init__(len(env_fns), observation_space, action_space)
+
+    # ------------------------------------------------------------------ talking to the workers
+
+    def _ask(self, command: str, arguments: Sequence[Any]) -> list[Any]:
+        self._tell(command, arguments)
+        return self._hear()
+
+    def _tell(self, command: str, arguments: Sequence[Any]) -> None:
+        for worker, (remote, argument) in enumerate(zip(self.remotes, arguments, strict=True)):
+            try:
+                remote.send((command, argument))
+            except (BrokenPipeError, ConnectionResetError, OSError):
+                self._fail(worker)
+
+    def _hear(self) -> list[Any]:
+        results = []
+        for worker, (remote, process) in enumerate(zip(self.remotes, self.processes, strict=True)):
+            wait([remote, process.sentinel])
+            try:
+                # An answer may still lie in the pipe of a worker that has ended since
+                status, result = remote.recv() if remote.poll() else self._fail(worker)
+            except (EOFError, ConnectionResetError):
+                self._fail(worker)
+            if status == "error":
+                env, text = result
+                self.close()
+                raise RuntimeError(f"Environment {self.first[worker] + env} raised an error:\n{text}")
+            results.append(result)
+        return results
+
+    def _fail(self, worker: int) -> Any:
+        process = self.processes[worker]
+        process.join(timeout=5)
+        code, first, last = process.exitcode, self.first[worker], self.first[worker + 1] - 1
+        self.close()
+        cause = f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
+        raise RuntimeError(f"The worker process with environments {first} to {last} has died ({cause})")
+
+    # ------------------------------------------------------------------ VecEnv
+
+    def _join(self, parts: list[Any]) -> VecEnvObs:
+        if isinstance(parts[0], dict):
+            return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        return np.concatenate(parts)
+
+    def _split(self, values: Any) -> list[Any]:
+        return [values[first:last] for first, last in zip(self.first[:-1], self.first[1:], strict=True)]
+
+    def reset(self) -> VecEnvObs:
+        """
+        :return: observations of new episodes
+        """
+        seeds_and_options = zip(self._split(self._seeds), self._split(self._options), strict=True)
+        answers = self._ask("reset", list(seeds_and_options))
+        self.reset_infos = [info for _, infos in answers for info in infos]
+        self._reset_seeds()
+        self._reset_options()
+        return self._join([observations for observations, _ in answers])
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """
+        :param actions: shape (n_envs, *action shape)
+        """
+        self._tell("step", self._split(actions))
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        :return: observations, rewards, dones and infos
+        """
+        observations, rewards, dones, infos, reset_infos = zip(*self._hear(), strict=True)
+        self.reset_infos = [info for part in reset_infos for info in part]
+        joined = [info for part in infos for info in part]
+        return self._join(list(observations)), np.concatenate(rewards), np.concatenate(dones), joined
+
+    def close(self) -> None:
+        """End the workers; those that do not end by themselves are killed."""
+        if self._closed:
+            return
+        self._closed = True
+        for remote in self.remotes:
+            try:
+                remote.send(("close", None))
+            except OSError:
+                pass  # gone already
+        for process in self.processes:
+            process.join(timeout=5)
+            if process.is_alive():
+                process.kill()
+                process.join()
+        for remote in self.remotes:
+            remote.close()
+
+    def _each(self, name: str, indices: VecEnvIndices, *arguments: Any, **keywords: Any) -> list[Any]:
+        """Call a method of the workers' ``DummyVecEnv`` for some environments, which are given it as ``indices``."""
+        chosen = list(self._get_indices(indices))
+        local = [[i - first for i in chosen if first <= i < last] for first, last in self._ranges()]
+        answers = self._ask("call", [(name, arguments, {**keywords, "indices": part}) for part in local])
+        by_env = {
+            first + i: value
+            for (first, _), part, values in zip(self._ranges(), local, answers, strict=True)
+            for i, value in zip(part, values or [None] * len(part), strict=True)
+        }
+        return [by_env[i] for i in chosen]
+
+    def _ranges(self) -> list[tuple[int, int]]:
+        return list(zip(self.first[:-1].tolist(), self.first[1:].tolist(), strict=True))
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """
+        :param attr_name: name of an attribute
+        :param indices: which environments, None for all
+        :return: one value per environment
+        """
+        return self._each("get_attr", indices, attr_name)
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """
+        :param attr_name: name of an attribute
+        :param value: its value
+        :param indices: which environments, None for all
+        """
+        self._each("set_attr", indices, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """
+        :param method_name: name of a method
+        :param indices: which environments, None for all
+        :return: one result per environment
+        """
+        return self._each("env_method", indices, method_name, *method_args, **method_kwargs)
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        """
+        :param wrapper_class: a wrapper
+        :param indices: which environments, None for all
+        :return: one answer per environment
+        """
+        return self._each("env_is_wrapped", indices, wrapper_class)
+
+    def has_attr(self, attr_name: str) -> bool:
+        """
+        :param attr_name: name of an attribute
+        :return: whether every environment has it
+        """
+        return all(self._ask("call", [("has_attr", (attr_name,), {})] * len(self.remotes)))
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """
+        :return: one RGB image per environment
+        """
+        if self.render_mode != "rgb_array":
+            return [None] * self.num_envs
+        return self.env_method("render")

@@ -1,0 +1,136 @@
+"""Environments in worker processes: as in one process, and what happens when one breaks."""
+
+import os
+import signal
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import AnySpaces, TwoEnds, image_dict_space, small_model
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_ddiffpg.envs import make_vec_env
+from sb3_ddiffpg.envs.workers import WorkerVecEnv
+
+
+class Fragile(TwoEnds):
+    """Raises, or dies, when it is told to."""
+
+    def step(self, action):
+        if abs(action[0]) > 0.99:
+            raise ZeroDivisionError("broken leg")
+        return super().step(action)
+
+    def die(self):
+        os._exit(3)
+
+
+@pytest.fixture
+def fragile():
+    env = WorkerVecEnv([Fragile] * 5, n_workers=2)
+    env.reset()
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize("make", [TwoEnds, lambda: AnySpaces(image_dict_space())])
+def test_like_one_process_bit_for_bit(make):
+    workers, single = WorkerVecEnv([make] * 5, n_workers=2), DummyVecEnv([make] * 5)
+    assert (workers.num_envs, len(workers.processes), workers.first.tolist()) == (5, 2, [0, 2, 5])
+    assert (workers.observation_space, workers.action_space) == (single.observation_space, single.action_space)
+
+    def same(ours, theirs):
+        if isinstance(theirs, dict):
+            assert ours.keys() == theirs.keys()
+            return all(same(ours[key], theirs[key]) for key in theirs)
+        return ours.dtype == theirs.dtype and np.array_equal(ours, theirs)
+
+    for env in (workers, single):
+        env.seed(3)
+    rng, n_done = np.random.default_rng(0), 0
+    assert same(workers.reset(), single.reset()) and workers.reset_infos == single.reset_infos
+    for _ in range(40):
+        actions = rng.uniform(-1, 1, (5, *workers.action_space.shape)).astype(np.float32)
+        (obs, *rest, infos), (other_obs, *other_rest, other_infos) = workers.step(actions), single.step(actions)
+        assert same(obs, other_obs) and all(same(a, b) for a, b in zip(rest, other_rest, strict=True))
+        for info, other in zip(infos, other_infos, strict=True):
+            assert info.keys() == other.keys() and info["TimeLimit.truncated"] == other["TimeLimit.truncated"]
+            if "terminal_observation" in info:
+                assert same(info["terminal_observation"], other["terminal_observation"])
+        n_done += rest[1].sum()
+    assert n_done > 5
+    workers.close()
+
+
+def test_attributes_and_methods(fragile):
+    fragile.set_attr("tag", "x", indices=[1, 4])
+    fragile.set_attr("tag", "y", indices=[0, 2, 3])
+    assert fragile.get_attr("tag") == ["y", "x", "y", "y", "x"] and fragile.get_attr("tag", [4, 0]) == ["x", "y"]
+    assert fragile.get_attr("tag", 1) == ["x"]
+    assert fragile.has_attr("tag") and not fragile.has_attr("no_such_thing")
+    assert fragile.env_is_wrapped(gym.Wrapper) == [False] * 5
+    assert [observation.shape for observation, _ in fragile.env_method("reset", indices=[2, 3])] == [(2,), (2,)]
+    assert fragile.get_images() == [None] * 5
+
+
+def test_an_error_names_its_environment(fragile):
+    actions = np.zeros((5, 1), dtype=np.float32)
+    fragile.step(actions)
+    actions[3] = 1.0
+    with pytest.raises(RuntimeError, match=r"(?s)Environment 3 raised an error:.*ZeroDivisionError: broken leg"):
+        fragile.step(actions)
+    assert not any(process.is_alive() for process in fragile.processes)
+
+
+@pytest.mark.parametrize("cause", ["killed", "exited"])
+def test_a_dead_worker_is_reported_and_does_not_hang(fragile, cause):
+    started = time.perf_counter()
+    if cause == "killed":
+        os.kill(fragile.processes[1].pid, signal.SIGKILL)
+        with pytest.raises(RuntimeError, match=r"with environments 2 to 4 has died \(signal 9\)"):
+            for _ in range(3):
+                fragile.step(np.zeros((5, 1)))
+    else:
+        with pytest.raises(RuntimeError, match=r"with environments 0 to 1 has died \(exit code 3\)"):
+            fragile.env_method("die", indices=[0])
+    assert time.perf_counter() - started < 20 and not any(process.is_alive() for process in fragile.processes)
+
+
+def test_an_environment_that_cannot_be_made():
+    def broken():
+        raise FileNotFoundError("no such robot")
+
+    with pytest.raises(RuntimeError, match=r"(?s)Environment \d raised an error:.*no such robot"):
+        WorkerVecEnv([TwoEnds, broken, TwoEnds], n_workers=3)
+
+
+def test_training_in_workers():
+    env = WorkerVecEnv([TwoEnds] * 4, n_workers=2)
+    model = small_model(env).learn(400)
+    assert len(model.modes) == 2
+    env.close()
+    env.close()  # twice does no harm
+
+
+def test_bad_arguments():
+    with pytest.raises(ValueError, match="n_workers: 0"):
+        WorkerVecEnv([TwoEnds], n_workers=0)
+
+
+def test_franka_in_workers():
+    pytest.importorskip("pybullet")
+    ours = make_vec_env("FrankaDrawerClose-v0", 4, seed=1, n_threads=2, max_episode_steps=6)
+    assert isinstance(ours.venv, WorkerVecEnv) and len(ours.venv.processes) == 2
+    single = DummyVecEnv([lambda: gym.make("FrankaDrawerClose-v0", max_episode_steps=6)] * 4)
+    single.seed(1)
+    np.testing.assert_array_equal(ours.reset(), single.reset())
+    rng = np.random.default_rng(0)
+    for _ in range(15):
+        actions = rng.uniform(-1, 1, (4, 7)).astype(np.float32)
+        for part, other in zip(ours.step(actions)[:3], single.step(actions)[:3], strict=True):
+            np.testing.assert_array_equal(part, other)
+    assert ours.get_attr("spec", 0)[0].id == "FrankaDrawerClose-v0"
+    assert ours.get_attr("mode_features", 2)[0].tolist() == [0, 1, 2]
+    ours.close()
+    single.close()
