@@ -181,18 +181,25 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         nobody = np.full(len(successes), NO_MODE), np.full(len(failures), NO_MODE)
         self.assign_modes(successes, nobody[0], failures, nobody[1], [None] * n_modes)
 
-    def renumber_modes(self, new_modes: list[int], n_modes: int) -> None:
+    def renumber_modes(self, new_modes: list[int], names: list[str]) -> None:
         """
-        Follow a model whose modes have other numbers.
+        Follow a model whose modes have other numbers. Commands to modes that it does not have are forgotten.
 
         :param new_modes: New index of every mode so far, ``NO_MODE`` if the model does not have it
-        :param n_modes: Number of modes of the model
+        :param names: Names of the model's modes
         """
-        successes, failures = self.trajectories(success=True), self.trajectories(success=False)
+        stored = self.trajectories(success=True) + self.trajectories(success=False)
+        for trajectory in stored:
+            if trajectory.foreign and trajectory.commanded not in names:
+                self.readmit(trajectory)
+            elif trajectory.commanded not in names:
+                trajectory.commanded = None
+        stored.sort(key=lambda trajectory: trajectory.serial)
+        parts = [[t for t in stored if (t.success and not t.foreign) == success] for success in (True, False)]
         table = np.array([*new_modes, NO_MODE])  # the last one for NO_MODE itself
-        labels = [table[np.array([t.mode for t in part], dtype=int)] for part in (successes, failures)]
-        parents = [new_modes.index(mode) if mode in new_modes else None for mode in range(n_modes)]
-        self.assign_modes(successes, labels[0], failures, labels[1], parents)
+        successes, failures = (table[np.array([t.mode for t in part], dtype=int)] for part in parts)
+        parents = [new_modes.index(mode) if mode in new_modes else None for mode in range(len(names))]
+        self.assign_modes(parts[0], successes, parts[1], failures, parents)
 
     def adopt_settings(self, other: "ModeReplayBuffer") -> None:
         """

@@ -6,6 +6,8 @@ import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_ddiffpg.trajectories import read_success
+
 
 class ClusteringCallback(BaseCallback):
     """
@@ -73,11 +75,13 @@ class ModeEvalCallback(EvalCallback):
         self._labels: set[Any] = set()
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
-        if not self._is_success_buffer:  # emptied at the beginning of each evaluation
-            self._labels = set()
         super()._log_success_callback(locals_, globals_)
         info = locals_["info"]
         if locals_["done"] and "mode" in info:
-            if info.get("is_success") and info["mode"] is not None:
+            if read_success(info, getattr(self.model, "success_key", None)) and info["mode"] is not None:
                 self._labels.add(info["mode"])
             self.logger.record("eval/n_modes", len(self._labels))
+
+    def _on_step(self) -> bool:
+        self._labels = set()
+        return super()._on_step()

@@ -513,19 +513,19 @@ class DDiffPG(OffPolicyAlgorithm):
         :return: One entry for every mode that was born, split, merged or retired
         """
         started = time.perf_counter()
-        found = find_modes(
-            self.replay_buffer,
-            self._modes,
-            self._cluster,
-            self.min_mode_size,
-            self.max_modes,
-            self.mode_patience,
-            self.mode_trials,
-            births=self._exploration_share() > 0,
-        )
         with uninterrupted():
+            found = find_modes(
+                self.replay_buffer,
+                self._modes,
+                self._cluster,
+                self.min_mode_size,
+                self.max_modes,
+                self.mode_patience,
+                self.mode_trials,
+                births=self._exploration_share() > 0,
+            )
             events = self._replace_modes(found)
-        found.describe(self._modes, self.replay_buffer)
+            found.describe(self._modes, self.replay_buffer)
         self.logger.record("modes/n_modes", len(self._modes))
         for mode in self._modes:
             self.logger.record(f"modes/{mode.name}/n_trajectories", mode.n_trajectories)
@@ -623,7 +623,7 @@ class DDiffPG(OffPolicyAlgorithm):
             if mode is not None:
                 trajectory.commanded = self._modes[mode].name
                 self._modes[mode].outcomes.append(trajectory.success)
-                self._modes[mode].misses += 1  # until the next clustering tells which route it took
+                self._modes[mode].unjudged += 1
             self._warn_outside_support(trajectory)
             self._behavior.begin(env, len(self._modes), self._exploration_share(), self.explore_then_exploit)
 
@@ -774,7 +774,7 @@ class DDiffPG(OffPolicyAlgorithm):
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
         Load a replay buffer of this model's run, saved with it or at another time: trajectories follow the names of their
-        modes. Its settings stay those that the model was made with.
+        modes. What trains a mode stays as the model was made; size and unit of distances are those of the file.
 
         :param path: Path to the pickled replay buffer
         :param truncate_last_traj: Whether the next ``learn`` resets the environments and drops the episodes in progress
@@ -798,7 +798,10 @@ class DDiffPG(OffPolicyAlgorithm):
         if previous is not None:
             loaded.adopt_settings(previous)
         names = [mode.name for mode in self._modes]
-        if loaded.owner[1] != names:
-            loaded.renumber_modes([names.index(name) if name in names else NO_MODE for name in loaded.owner[1]], len(names))
+        if loaded.owner != (self.run_id, names):
+            loaded.renumber_modes([names.index(name) if name in names else NO_MODE for name in loaded.owner[1]], names)
+            # A mode that the file knows must not lend its name to another one
+            numbers = [int(name.removeprefix("mode_")) for name in loaded.owner[1] if name.removeprefix("mode_").isdigit()]
+            self._next_mode_number = max([self._next_mode_number, *(number + 1 for number in numbers)])
         if truncate_last_traj:
             self._last_obs = None

@@ -23,6 +23,7 @@ class Mode:
     :param outcomes: Success of the latest training episodes that were commanded to this mode
     :param doubts: Re-clusterings in a row that found it within another mode's cluster
     :param misses: Training episodes in a row that were commanded to it and did not reach the goal by its route
+    :param unjudged: Commanded training episodes since the last clustering, which has not told yet by which route they went
     :param embedding: The vector that commands it; filled in by ``model.modes``, owned by the policy
     """
 
@@ -35,6 +36,7 @@ class Mode:
     outcomes: deque[bool] = field(default_factory=lambda: deque(maxlen=100), repr=False)
     doubts: int = field(default=0, repr=False)
     misses: int = field(default=0, repr=False)
+    unjudged: int = field(default=0, repr=False)
     embedding: np.ndarray | None = field(default=None, repr=False)
 
     @property

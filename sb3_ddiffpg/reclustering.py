@@ -83,13 +83,15 @@ def find_modes(
         labels = cluster(distances)
 
     rng = np.random.RandomState(np.random.randint(2**31))
-    dormant = _dormant(found, len(modes))
+    dormant = [mode for mode in _dormant(found, len(modes)) if mode not in given_up]
     old_labels = _old_labels(buffer, successes, modes, dormant, rng)
     labels = _defend(modes, distances, old_labels, labels, patience, max_modes)
     if modes and not births:
         labels = _without_births(old_labels, labels, len(modes))
     inheritance = _with_dormant(match_modes(old_labels, labels, len(modes), _count(labels)), dormant, max_modes)
 
+    for mode in modes:
+        mode.misses, mode.unjudged = mode.misses + mode.unjudged, 0
     told = {modes[old].name: new for new, old in enumerate(inheritance.parents) if old is not None and inheritance.kept[new]}
     for trajectory, label in zip(successes, labels.tolist(), strict=True):
         if trajectory.mode == NO_MODE and label != NO_MODE and told.get(trajectory.commanded or "") == label:

@@ -4,6 +4,7 @@ import copy
 import pickle
 import warnings
 from importlib.resources import files
+from pathlib import Path
 
 import gymnasium as gym
 import mujoco
@@ -193,6 +194,18 @@ def test_copies_go_on_like_the_original(clone, n_blocked):
     for actions in second:
         for ours, theirs in zip(env.step(actions)[:3], twin.step(actions)[:3], strict=True):
             np.testing.assert_array_equal(ours, theirs)
+
+
+def test_closing_ends_the_threads():
+    before = len(list(Path("/proc/self/task").iterdir())) if Path("/proc/self/task").exists() else pytest.skip("no /proc")
+    envs = [AntMazeVecEnv(2, "V1", n_threads=3) for _ in range(3)]
+    for env in envs:
+        env.reset()
+        first = env.step(np.zeros((2, 8)))[0]
+        env.close()
+    assert len(list(Path("/proc/self/task").iterdir())) == before
+    assert first.shape == envs[0].step(np.zeros((2, 8)))[0].shape  # made anew
+    envs[0].close()
 
 
 def test_interface_and_arguments():

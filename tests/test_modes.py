@@ -320,6 +320,33 @@ def test_misses_are_counted_until_the_route_is_taken(two_routes):
     assert model.recluster() == [] and mode.misses == 0
 
 
+def test_an_obedient_mode_is_not_given_up_however_rarely_it_is_clustered(two_routes):
+    """More commanded episodes than trials between two clusterings; of one mode all obey, of the other none."""
+    model = two_routes
+    model.mode_trials = 20
+    for _ in range(3):
+        for mode, route in (("mode_1", "up"), ("mode_0", "up")):
+            walk(model, route, 25)
+            for trajectory in model.replay_buffer.trajectories(True)[-25:]:
+                trajectory.commanded = mode
+            model.modes[mode].unjudged = 25
+        events = model.recluster()
+        if events:
+            break
+        assert model.modes["mode_1"].misses == 0 and model.modes["mode_0"].misses == 25
+    assert events == ["mode_0 retired"] and model.modes.names == ["mode_1"]
+
+
+def test_a_dormant_mode_is_given_up_too(two_routes):
+    model = two_routes
+    model.replay_buffer.reset()
+    model.replay_buffer.expect_modes(2)
+    walk(model, "up", 4)
+    assert model.recluster() == []
+    model.modes["mode_0"].misses = model.mode_trials
+    assert model.recluster() == ["mode_0 retired"] and model.modes.names == ["mode_1"]
+
+
 def test_the_last_modes_are_not_given_up(two_routes):
     """When none can be commanded, the policy is at fault."""
     for mode in two_routes.modes:
@@ -452,6 +479,7 @@ def test_an_interrupt_waits_until_all_follow_the_clustering(two_routes, monkeypa
         model.recluster()
     monkeypatch.undo()
     assert len(model.modes) == model.policy.n_modes == len(model.replay_buffer.mode_rows) == 3
+    assert all(len(mode.representative) and mode.n_trajectories for mode in model.modes)
     model.train(1, 32)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 

@@ -87,6 +87,29 @@ def test_obstacles_are_not_observed_but_told_and_drawn():
     assert PointMazeEnv("V3").reset()[1] == {}
 
 
+def test_no_body_begins_in_an_obstacle():
+    """Start noise reaches into a gap cell; a position that is asked for is one."""
+    rows = ["#######", "#..r.g#", "#.#.#.#", "#.....#", "#######"]
+    env = PointMazeVecEnv(200, rows, n_blocked=1, start_noise=(4.0, 0.0))
+    env.seed(0)
+    env.reset()
+    reach = np.array([4.4, 0.4])
+    assert len({info["blocked"] for info in env.reset_infos}) > 1
+    for info in env.reset_infos:
+        for cell in info["blocked"]:
+            assert (np.abs(env.maze.cell_center(cell)) >= 2 + reach).any()
+    lone = PointMazeEnv("V3", n_blocked=2)
+    gap = (3, 2)
+    assert all(gap not in lone.reset(options={"position": (-8, 4)})[1]["blocked"] for _ in range(40))
+    with pytest.raises(ValueError, match="but the body begins there"):
+        lone.reset(options={"position": (-8, 4), "blocked": [gap]})
+
+
+def test_a_hollow_island_has_no_passage():
+    rows = ["########", "#r....g#", "#..#...#", "#.#.#..#", "#.###..#", "#......#", "########"]
+    assert Maze(rows).gap_cells == [(1, 3), (5, 3)]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

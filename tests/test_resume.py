@@ -244,8 +244,10 @@ def test_trajectories_follow_the_names_of_their_modes(saved):
     later = DDiffPG.load(folder / "model", env=two_ends())
     later.load_replay_buffer(folder / "buffer")
     improved = later.replay_buffer.target_actions.copy()
-    later.replay_buffer.renumber_modes([2, 0], 3)
     later._modes = [later._modes[1], Mode("mode_9", born_at=7), later._modes[0]]
+    later.replay_buffer.renumber_modes([2, 0], [mode.name for mode in later._modes])
+    strayed = later.replay_buffer.trajectories(False)[-1]
+    strayed.commanded = "mode_9"
     later.save_replay_buffer(folder / "later")
     loaded = DDiffPG.load(folder / "model", env=two_ends())
     loaded.load_replay_buffer(folder / "later")
@@ -255,6 +257,9 @@ def test_trajectories_follow_the_names_of_their_modes(saved):
         if trajectory.mode != NO_MODE:
             assert np.sign(buffer.full_path(trajectory)[-1, 0]) == route[loaded.modes[trajectory.mode].name]
     np.testing.assert_array_equal(buffer.target_actions, improved)
+    # The next mode is not taken for the one whose name only the file knows
+    assert "mode_9" not in {t.commanded for success in (True, False) for t in buffer.trajectories(success)}
+    assert loaded._next_mode_number == 10
 
 
 def test_a_buffer_for_another_number_of_environments_is_refused(trained, tmp_path):

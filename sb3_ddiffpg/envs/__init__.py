@@ -75,7 +75,7 @@ def make_vec_env(
         return VecMonitor(workers)
     if spec.entry_point not in _VEC_ENVS:
         return make_sb3_vec_env(env_id, n_envs, seed=seed, env_kwargs=env_kwargs)
-    limit = env_kwargs.pop("max_episode_steps", spec.max_episode_steps)
+    limit = env_kwargs.pop("max_episode_steps", None) or spec.max_episode_steps
     kwargs = {"render_mode": "rgb_array", **spec.kwargs, **env_kwargs}
     threads = {} if n_threads is None or spec.entry_point == _POINT_MAZE else {"n_threads": n_threads}
     make: Any = load_env_creator(_VEC_ENVS[spec.entry_point])

@@ -40,7 +40,7 @@ class AntSimulation(MazeSimulation):
     :param goal_rewards: reward for reaching each goal, in reading order of the map.
         None: (2, 1) in maze V2, 1 for every goal elsewhere
     :param goal_radius: a goal is reached when the torso's centre is within this distance of its centre, in metres
-    :param integrator: ``"rk4"``, as D4RL, or ``"euler"``, about four times faster and close to it, but not the same
+    :param integrator: ``"rk4"``, as D4RL, or ``"euler"``, two to three times faster and close to it, but not the same
     :param n_blocked: gap cells that are walled in each episode, see :class:`MazeSimulation`
     :param n_threads: threads that step the ants; None: one per processor this process may use, 0 for a single ant
     :raises ValueError: if an argument is out of its range or the start box overlaps a wall
@@ -140,7 +140,7 @@ class AntSimulation(MazeSimulation):
         """
         model = self._models[i]
         if self._viewer is None or self._viewer.model is not model:
-            self.close()
+            self._close_viewer()
             self._viewer = _make_viewer(model)
             x_min, x_max, y_min, y_max = self.maze.extent
             camera = self._viewer.cam
@@ -152,7 +152,13 @@ class AntSimulation(MazeSimulation):
         return self._viewer.render("rgb_array")
 
     def close(self) -> None:
-        """Release what pictures needed."""
+        """Release threads and what pictures needed; both are made anew when they are needed again."""
+        if self._pool is not None:
+            self._pool.close()
+            self._pool, self._datas = None, []
+        self._close_viewer()
+
+    def _close_viewer(self) -> None:
         if self._viewer is not None:
             self._viewer.close()
             self._viewer = None

@@ -75,7 +75,9 @@ class MazeSimulation:
         self.goal_radius = goal_radius
         # One more entry for -1, "no goal".
         self.rewards = np.array([*goal_rewards, 0.0])
-        self._choices = self._solvable_choices(n_blocked)
+        self._choices = [c for c in self._solvable_choices(n_blocked) if self._is_clear(c, self.maze.start, reach)]
+        if not self._choices:
+            raise ValueError(f"n_blocked: {n_blocked} given, but wherever they are, they stand on the start")
         #: Whether gap cells can be walled
         self.has_obstacles = n_blocked > 0
         self.blocked: list[tuple[Cell, ...]] = [()] * n
@@ -149,8 +151,16 @@ class MazeSimulation:
         if not self.has_obstacles:
             return Start(position)
         if "blocked" in options:
-            return Start(position, self._checked(options["blocked"]))
-        return Start(position, self._choices[rng.integers(len(self._choices))])
+            blocked = self._checked(options["blocked"])
+            if not self._is_clear(blocked, position, self.half_size):
+                raise ValueError(f"options: blocked {options['blocked']} given, but the body begins there")
+            return Start(position, blocked)
+        choices = self._choices
+        if "position" in options:
+            choices = [cells for cells in choices if self._is_clear(cells, position, self.half_size)]
+            if not choices:
+                raise ValueError(f"options: position {options['position']} given, where obstacles always stand")
+        return Start(position, choices[rng.integers(len(choices))])
 
     def place(self, indices: Sequence[int] | npt.NDArray[np.intp], starts: Sequence[Start]) -> None:
         """
@@ -217,6 +227,11 @@ class MazeSimulation:
         if not choices:
             raise ValueError(f"n_blocked: {n_blocked} given, but wherever they are, a goal cannot be reached")
         return choices
+
+    def _is_clear(self, blocked: tuple[Cell, ...], position: FloatArray, reach: FloatArray | float) -> bool:
+        """Whether no obstacle comes within reach of a position, in x and y."""
+        offsets = [np.abs(self.maze.cell_center(cell) - position) - reach for cell in blocked]
+        return all((offset >= CELL_SIZE / 2).any() for offset in offsets)
 
     def _reachable(self, blocked: tuple[Cell, ...]) -> list[int]:
         """Goals that can be reached behind these obstacles."""

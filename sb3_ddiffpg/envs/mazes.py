@@ -186,6 +186,7 @@ class Maze:
         self._flat_walls = self.walls.ravel()
 
         reachable = cell_distances(~self.walls, self.start_cell) >= 0
+        self._reachable = reachable
         for cell in self.goal_cells:
             if not reachable[cell]:
                 raise ValueError(f"maze_map: there is no way from the start {self.start_cell} to the goal {cell}")
@@ -226,7 +227,7 @@ class Maze:
         """Open cells between two walls, one above and one below, in a column where an island has its cut: the ways past it."""
         columns = {round((cut.x - self.extent[0]) / CELL_SIZE - 0.5) for cut in self.cuts}
         middle = np.zeros_like(self.walls)
-        middle[1:-1] = ~self.walls[1:-1] & self.walls[:-2] & self.walls[2:]
+        middle[1:-1] = self._reachable[1:-1] & ~self._reachable[:-2] & ~self._reachable[2:]
         taken = {self.start_cell, *self.goal_cells}
         return [cell for cell in _cells_where(middle) if cell[1] in columns and cell not in taken]
 
