@@ -33,6 +33,8 @@ def plot_routes(episodes: Mapping[str, Sequence[EpisodeResult]], maze: Any = Non
     legend = figure.legend(loc="outside right upper")
     for handle in filter(None, legend.legend_handles):
         handle.set_alpha(1.0)
+        if hasattr(handle, "set_linestyle") and handle.get_linestyle() == "--":
+            handle.set_linestyle("-")  # the name's first episode failed, which says nothing of the name
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
