@@ -31,7 +31,8 @@ def plot_routes(episodes: Mapping[str, Sequence[EpisodeResult]], maze: Any = Non
             style = "--" if run.success is False else "-"
             axes.plot(run.path[:, 0], run.path[:, 1], style, color=color, alpha=0.35, lw=1, label=None if i else name)
     legend = figure.legend(loc="outside right upper")
-    for handle in filter(None, legend.legend_handles):
+    handles: list[Any] = [handle for handle in legend.legend_handles if handle is not None]
+    for handle in handles:
         handle.set_alpha(1.0)
         if hasattr(handle, "set_linestyle") and handle.get_linestyle() == "--":
             handle.set_linestyle("-")  # the name's first episode failed, which says nothing of the name
