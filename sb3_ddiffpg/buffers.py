@@ -9,12 +9,11 @@ from gymnasium import spaces
 from scipy.spatial.distance import cdist
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
 from sb3_ddiffpg.dtw import erase_loops, resample_path
 from sb3_ddiffpg.features import ModeFeatures
 from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, Trajectory
 from sb3_ddiffpg.trajectory_buffer import TrajectoryReplayBuffer
-
-EXPLORATORY = 0  # the first group of a batch
 
 
 class ModeBatch(NamedTuple):
@@ -380,10 +379,10 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         rewards = self._normalize_reward(self.rewards[windows.ravel()], env).reshape(windows.shape)
         # For its mode a step off the route ends the episode without reward, so that no way back is worth anything
         lost = np.logical_or.accumulate(self.off_route[windows] & present, axis=-1)
-        lost[EXPLORATORY] = False
+        lost[EXPLORATORY_GROUP] = False
         # What led away from the route is for the critic to judge, not for the policy to follow
         imitated = active[:, None] & ~self.foreign[rows]
-        imitated[EXPLORATORY] = True
+        imitated[EXPLORATORY_GROUP] = True
         rewards = (np.where(present & ~lost, rewards, 0.0) * powers).sum(axis=-1)  # [G, n]
         lengths = present.sum(axis=-1)
         last = np.take_along_axis(windows, lengths[..., None] - 1, axis=-1)[..., 0]

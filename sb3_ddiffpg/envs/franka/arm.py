@@ -29,7 +29,7 @@ MAX_TURN = 0.05
 
 _FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0)
 _FINGERS, _FINGER_OPENING = (9, 10), 0.015
-_HAND, _GRASP = 8, 11
+_GRASP = 11
 _ARM_FOLDER = Path(pybullet_data.getDataPath()) / "franka_panda"
 
 
@@ -69,17 +69,16 @@ class PandaArm:
         self.low, self.high = np.array(limits).T
         self.targets = np.zeros(7)
 
-    def load(self, urdf: str, position: Sequence[float], fixed: bool = True) -> int:
+    def load(self, urdf: str, position: Sequence[float]) -> int:
         """
         :param urdf: text of a robot description
-        :param position: of its base
-        :param fixed: whether the base cannot move
+        :param position: of its base, which cannot move
         :return: the body's number
         """
         with TemporaryDirectory() as folder:
             path = Path(folder) / "body.urdf"
             path.write_text(urdf)
-            return self.client.loadURDF(str(path), list(position), useFixedBase=fixed, flags=self._flags)
+            return self.client.loadURDF(str(path), list(position), useFixedBase=True, flags=self._flags)
 
     def reset(self, angles: FloatArray) -> None:
         """
