@@ -70,14 +70,14 @@ def register() -> None:
     rl_zoo3.exp_manager.EvalCallback = ModeEvalCallback  # type: ignore[misc, assignment]
 
 
-def config_file(algo: str) -> Path | None:
+def config_file(name: str) -> Path | None:
     """
-    :param algo: Name of an algorithm in the zoo
-    :return: Our YAML file for it, installed or in a checkout; None when there is none
+    :param name: Of a YAML file of ours: ``ddiffpg`` or ``ddiffpg-cpu``
+    :return: Where it is, installed or in a checkout; None when there is none
     """
     package = Path(__file__).parent
     for folder in (package, package.parent):
-        if (path := folder / "zoo_hyperparams" / f"{algo}.yml").is_file():
+        if (path := folder / "zoo_hyperparams" / f"{name}.yml").is_file():
             return path
     return None
 
@@ -237,18 +237,19 @@ def commanded_to(mode: str | int) -> type[DDiffPG]:
 
 def train(arguments: Sequence[str]) -> None:
     """
-    The zoo's training script. Takes ``--n-envs`` beside its options.
+    The zoo's training script. Takes ``--n-envs`` beside its options, and as ``--conf-file`` also the name of a file of ours.
 
     :param arguments: Command line, without the name of the program
     """
     parser = _parser()
     parser.add_argument("--n-envs", type=int)
+    parser.add_argument("-conf", "--conf-file")
     parser.add_argument("-params", "--hyperparams", nargs="+", default=[])
     known, rest = _read(parser, arguments)
     hyperparams = [*known.hyperparams, *([] if known.n_envs is None else [f"n_envs:{known.n_envs}"])]
     if hyperparams:
         rest += ["--hyperparams", *hyperparams]
-    path = config_file(known.algo)
+    path = config_file(known.conf_file or known.algo) or known.conf_file
     with _command_line([*([] if path is None else ["--conf-file", str(path)]), *rest]):
         rl_zoo3.train.train()
 

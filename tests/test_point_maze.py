@@ -61,15 +61,20 @@ def test_driven_routes_get_their_labels(name, label):
     n = 50
     env = PointMazeVecEnv(n, name)
     env.seed(0)
-    driver, observations, modes, steps = Driver([ROUTES[name, label]] * n, jitter=0.5), env.reset(), {}, 0
+    driver, observations, steps = Driver([ROUTES[name, label]] * n, jitter=0.5), env.reset(), 0
+    modes, lengths = {}, {}
     while len(modes) < n:
         observations, rewards, dones, infos = env.step(driver(observations))
         steps += 1
         for i in np.flatnonzero(dones):
             modes.setdefault(i, infos[i]["mode"])
+            lengths.setdefault(i, steps)
             assert infos[i]["goal_id"] == int(label[0])
             assert rewards[i] == (2.0 if (name, label) == ("V2", "0:-") else 1.0)
             driver.restart(i)
+    print(
+        f"{name} {label}: {sum(mode == label for mode in modes.values())} of {n}, {np.mean(list(lengths.values())):.1f} steps"
+    )
     assert set(modes.values()) == {label}
     assert steps < 100
 

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import gymnasium as gym
@@ -103,6 +105,16 @@ def test_an_environment_that_cannot_be_made():
 
     with pytest.raises(RuntimeError, match=r"(?s)Environment \d raised an error:.*no such robot"):
         WorkerVecEnv([TwoEnds, broken, TwoEnds], n_workers=3)
+
+
+def test_a_script_without_guard_is_told(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import gymnasium\nfrom sb3_ddiffpg.envs.workers import WorkerVecEnv\n"
+        "WorkerVecEnv([lambda: gymnasium.make('CartPole-v1')] * 2)\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "must do so under `if __name__ == '__main__':`" in done.stderr.splitlines()[-1]
 
 
 def test_training_in_workers():

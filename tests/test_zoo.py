@@ -224,15 +224,28 @@ def test_qf_learning_rate_as_text():
         parse({"qf_learning_rate": "fast"})
 
 
-def test_our_configuration():
+@pytest.mark.parametrize("name", ["ddiffpg", "ddiffpg-cpu"])
+def test_our_configuration(name):
     zoo.register()
-    entries = yaml.safe_load(zoo.config_file("ddiffpg").read_text())
+    entries = yaml.safe_load(zoo.config_file(name).read_text())
     gym.register_envs(gymnasium_robotics)
-    for name, entry in entries.items():
+    for env_id, entry in entries.items():
         check_hyperparameters("ddiffpg", list(entry))
-        assert {"policy", "n_timesteps"} <= set(entry), name
-        assert name in ("paper", "default") or name in gym.registry
+        assert {"policy", "n_timesteps"} <= set(entry), env_id
+        assert env_id in ("paper", "default") or env_id in gym.registry
+    ours = {env_id for env_id in gym.registry if str(gym.spec(env_id).entry_point).startswith("sb3_ddiffpg.")}
+    assert len(ours) == 14
+    assert {env_id for env_id in ours if name == "ddiffpg" or not env_id.startswith("Point")} <= set(entries)
     assert zoo.config_file("td3") is None
+
+
+def test_a_configuration_of_ours_by_name(tmp_path):
+    options = ["--env", "AntMazeV1-v0", "-f", str(tmp_path), "-n", "8", *hyperparams(n_envs=4)]
+    main(["train", "--conf-file", "ddiffpg-cpu", *options])
+    config = yaml.unsafe_load((tmp_path / "ddiffpg" / "AntMazeV1-v0_1" / "AntMazeV1-v0" / "config.yml").read_text())
+    assert config["env_kwargs"] == {"integrator": "euler"} and config["n_envs"] == 4
+    with pytest.raises(FileNotFoundError, match=r"no\.yml"):
+        main(["train", "--env", ENV, "--conf-file", "no.yml", "-f", str(tmp_path)])
 
 
 def test_papers_numbers():

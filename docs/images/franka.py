@@ -7,8 +7,8 @@ import matplotlib.pyplot as plt
 
 import sb3_ddiffpg.envs  # noqa: F401 - registers the environments
 
-figure, axes = plt.subplots(1, 3, figsize=(12, 4.1))
-for axis, name in zip(axes, ("Reach", "PegInHole", "DrawerClose"), strict=True):
+figure, axes = plt.subplots(1, 4, figsize=(14, 3.6))
+for axis, name in zip(axes, ("Reach", "PegInHole", "DrawerClose", "CabinetOpen"), strict=True):
     env = gym.make(f"Franka{name}-v0", render_mode="rgb_array")
     env.reset(seed=0)
     axis.imshow(env.render())

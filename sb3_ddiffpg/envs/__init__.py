@@ -42,7 +42,7 @@ _random: dict[str, Any] = {"maze_map": "V3", "n_blocked": 2}
 gym.register("PointMazeRandom-v0", entry_point=_POINT_MAZE, max_episode_steps=150, kwargs=_random)
 gym.register("AntMazeRandom-v0", entry_point=_ANT_MAZE, max_episode_steps=700, kwargs=_random)
 _FRANKA = "sb3_ddiffpg.envs.franka.tasks:Franka"
-for _name in ("Reach", "PegInHole", "DrawerClose"):
+for _name in ("Reach", "PegInHole", "DrawerClose", "CabinetOpen"):
     gym.register(f"Franka{_name}-v0", entry_point=f"{_FRANKA}{_name}", max_episode_steps=100)
 
 

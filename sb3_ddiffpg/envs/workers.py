@@ -86,7 +86,7 @@ class WorkerVecEnv(VecEnv):
         context: Any = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
         self.remotes: list[Connection] = []
         self.processes: list[Any] = []
-        self._closed = False
+        self._closed = self._made = False
         for first, last in zip(self.first[:-1], self.first[1:], strict=True):
             remote, theirs = context.Pipe()
             # A daemon, so that it does not outlive a crash of this process
@@ -98,6 +98,7 @@ class WorkerVecEnv(VecEnv):
             self.remotes.append(remote)
             self.processes.append(process)
         observation_space, action_space, self.render_mode = self._ask("make", [None] * n_workers)[0]
+        self._made = True
         super().__init__(len(env_fns), observation_space, action_space)
 
     # ------------------------------------------------------------------ talking to the workers
@@ -135,7 +136,8 @@ class WorkerVecEnv(VecEnv):
         code, first, last = process.exitcode, self.first[worker], self.first[worker + 1] - 1
         self.close()
         cause = f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
-        raise RuntimeError(f"The worker process with environments {first} to {last} has died ({cause})")
+        hint = "" if self._made else ". A script that makes such environments must do so under `if __name__ == '__main__':`"
+        raise RuntimeError(f"The worker process with environments {first} to {last} has died ({cause}){hint}")
 
     # ------------------------------------------------------------------ VecEnv
 

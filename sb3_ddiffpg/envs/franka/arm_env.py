@@ -1,0 +1,148 @@
+"""An arm with a task, as gymnasium wants it."""
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from sb3_ddiffpg.envs.franka.arm import FloatArray, PandaArm
+from sb3_ddiffpg.envs.franka.bodies import Color, Triple, box
+
+Image = npt.NDArray[np.uint8]
+
+_METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}
+
+
+class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
+    """
+    A Panda arm with a task. The observation is position and velocity of the point between the fingertips, then what the task
+    adds; an action turns the seven joints. The reward is 1 when the task is done, which ends the episode, and 0 before.
+    ``info`` holds on every step ``is_success`` and ``mode`` (the way it was done; None before). The time limit is the
+    registration's (100 steps of 0.04 s).
+
+    :param render_mode: None or ``"rgb_array"``
+    :param obs_joints: whether the seven joint angles are observed too
+    """
+
+    metadata = _METADATA
+
+    base_x: ClassVar[float]
+    start_angles: ClassVar[tuple[float, ...]]
+    start_noise: ClassVar[float] = 0.0
+    force_scale: ClassVar[float] = 1.0
+    tool: ClassVar[str] = ""
+    #: What stands in the middle of a picture
+    looks_at: ClassVar[tuple[float, float, float]]
+    #: Number of values that the task adds to the observation
+    n_extra: ClassVar[int] = 0
+
+    def __init__(self, render_mode: str | None = None, obs_joints: bool = False) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode: {render_mode!r} given; accepted are None and 'rgb_array'")
+        self.render_mode = render_mode
+        self.obs_joints = obs_joints
+        self.mode_features = np.arange(3)
+        size = 6 + self.n_extra + 7 * obs_joints
+        self.observation_space = spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (7,), dtype=np.float32)
+        self._make_world()
+
+    def _make_world(self) -> None:
+        self.arm = PandaArm(self.base_x, self.render_mode is not None, self.force_scale, self.tool)
+        self._build()
+        self.arm.reset(np.array(self.start_angles))
+        # Contacts of an earlier episode must not reach into the next
+        self._fresh = self.arm.client.saveState()
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise TypeError(f"{type(self).__name__} cannot be copied: a pybullet world stays in its process; make another")
+
+    # ------------------------------------------------------------------ what a task is
+
+    def _build(self) -> None:
+        """Put things around the arm."""
+        raise NotImplementedError
+
+    def _begin(self) -> None:
+        """Bring them to where an episode begins."""
+
+    def _extra(self) -> FloatArray:
+        """What they add to the observation, shape (n_extra,)."""
+        return np.zeros(0)
+
+    def _follow(self, before: FloatArray, after: FloatArray) -> None:
+        """Take note of a movement of the fingertips."""
+
+    def _done_by(self) -> str | None:
+        """The way by which the task is done, None if it is not."""
+        raise NotImplementedError
+
+    # ------------------------------------------------------------------ gymnasium
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+        """
+        :param seed: new seed of ``np_random``
+        :param options: none are accepted
+        :return: observation and an empty info
+        :raises ValueError: if there are options
+        """
+        super().reset(seed=seed)
+        if options:
+            raise ValueError(f"options: {sorted(options)} given; there are none")
+        self.arm.client.restoreState(self._fresh)
+        noise = self.start_noise * self.np_random.uniform(-1.0, 1.0, 7)
+        self.arm.reset(np.clip(np.array(self.start_angles) + noise, self.arm.low, self.arm.high))
+        self._begin()
+        return self._observation(), {}
+
+    def step(self, action: npt.NDArray[Any]) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """
+        :param action: change of the joints' targets, in units of 0.05 rad, shape (7,)
+        :return: observation, reward, terminated, truncated (never), info
+        :raises ValueError: if the action is not a number or its shape is wrong
+        """
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (7,) or not np.isfinite(action).all():
+            raise ValueError(f"action: shape {action.shape} given; accepted are finite numbers of shape (7,)")
+        before, _ = self.arm.end_effector()
+        self.arm.step(np.clip(action, -1.0, 1.0))
+        after, _ = self.arm.end_effector()
+        self._follow(before, after)
+        mode = self._done_by()
+        done = mode is not None
+        return self._observation(), float(done), done, False, {"is_success": done, "mode": mode}
+
+    def _observation(self) -> npt.NDArray[np.float32]:
+        position, velocity = self.arm.end_effector()
+        joints = [self.arm.angles()] if self.obs_joints else []
+        return np.concatenate([position, velocity, self._extra(), *joints]).astype(np.float32)
+
+    def render(self) -> Image | None:
+        """
+        :return: RGB image, shape (480, 480, 3), if the render mode is ``"rgb_array"``
+        """
+        if self.render_mode is None:
+            return None
+        client = self.arm.client
+        x, y, z = self.looks_at
+        view = client.computeViewMatrixFromYawPitchRoll([x, y, z], 1.5, -60.0, -25.0, 0.0, 2)
+        projection = client.computeProjectionMatrixFOV(50.0, 1.0, 0.05, 5.0)
+        _, _, pixels, *_ = client.getCameraImage(480, 480, view, projection, renderer=client.ER_TINY_RENDERER)
+        return np.reshape(np.asarray(pixels, dtype=np.uint8), (480, 480, 4))[..., :3].copy()
+
+    def close(self) -> None:
+        """Release the world."""
+        self.arm.close()
+
+    def _add_box(self, center: Triple, size: Triple, color: Color) -> None:
+        """A box that does not move, by its centre and edges in metres."""
+        self.arm.load(box(size, color), center)
+
+    def _brake(self, body: int, joint: int, force: float) -> None:
+        """Hold a joint that nothing drives, by at most so many N or Nm."""
+        client = self.arm.client
+        client.setJointMotorControl2(body, joint, client.VELOCITY_CONTROL, targetVelocity=0.0, force=force)
