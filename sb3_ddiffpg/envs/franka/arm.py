@@ -125,6 +125,24 @@ class PandaArm:
         orientation = self.client.getLinkState(self.body, _GRASP, computeForwardKinematics=1)[5]
         return np.array(self.client.getMatrixFromQuaternion(orientation)).reshape(3, 3)[:, 2]
 
+    def snapshot(self) -> bytes:
+        """
+        :return: positions, velocities and contacts of all bodies
+        """
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "world.bullet"
+            self.client.saveBullet(str(path))
+            return path.read_bytes()
+
+    def restore(self, snapshot: bytes) -> None:
+        """
+        :param snapshot: of a world with the same bodies
+        """
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "world.bullet"
+            path.write_bytes(snapshot)
+            self.client.restoreState(fileName=str(path))
+
     def close(self) -> None:
         """Release the world."""
         if self.client.isConnected():

@@ -57,7 +57,15 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         self._fresh = self.arm.client.saveState()
 
     def __getstate__(self) -> dict[str, Any]:
-        raise TypeError(f"{type(self).__name__} cannot be copied: a pybullet world stays in its process; make another")
+        """A world stays in its process: what is pickled or copied is how things stand in it."""
+        state = {name: value for name, value in self.__dict__.items() if name not in ("arm", "_fresh")}
+        return {**state, "_world": self.arm.snapshot()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        world = state.pop("_world")
+        self.__dict__.update(state)
+        self._make_world()
+        self.arm.restore(world)
 
     # ------------------------------------------------------------------ what a task is
 
