@@ -15,7 +15,7 @@ import yaml
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.evaluation import EpisodeResult, run_episodes
+from sb3_ddiffpg.episodes import EpisodeResult, run_episodes
 from sb3_ddiffpg.plots import plot_routes
 
 PRESETS = Path(__file__).parent.parent / "zoo_hyperparams" / "ddiffpg.yml"

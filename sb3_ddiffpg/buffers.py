@@ -131,7 +131,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     def reset(self) -> None:
         """Forget everything and release the storage."""
         super().reset()
-        self.owner: tuple[str, list[str]] = ("", [])  # run and names of its modes, noted when it is saved
+        self.owner: tuple[str, list[int]] = ("", [])  # run and numbers of its modes, noted when it is saved
         self._feature_scale: np.ndarray | None = None
         self._distances = DistanceCache(self.normalize_distances)
         self._mode_position = np.empty(0, dtype=np.int32)
@@ -180,24 +180,24 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         nobody = np.full(len(successes), NO_MODE), np.full(len(failures), NO_MODE)
         self.assign_modes(successes, nobody[0], failures, nobody[1], [None] * n_modes)
 
-    def renumber_modes(self, new_modes: list[int], names: list[str]) -> None:
+    def follow_modes(self, new_modes: list[int], numbers: list[int]) -> None:
         """
-        Follow a model whose modes have other numbers. Commands to modes that it does not have are forgotten.
+        Follow a model whose modes have other indices. Commands to modes that it does not have are forgotten.
 
         :param new_modes: New index of every mode so far, ``NO_MODE`` if the model does not have it
-        :param names: Names of the model's modes
+        :param numbers: Numbers of the model's modes
         """
         stored = self.trajectories(success=True) + self.trajectories(success=False)
         for trajectory in stored:
-            if trajectory.foreign and trajectory.commanded not in names:
+            if trajectory.foreign and trajectory.commanded not in numbers:
                 self.readmit(trajectory)
-            elif trajectory.commanded not in names:
+            elif trajectory.commanded not in numbers:
                 trajectory.commanded = None
         stored.sort(key=lambda trajectory: trajectory.serial)
         parts = [[t for t in stored if (t.success and not t.foreign) == success] for success in (True, False)]
         table = np.array([*new_modes, NO_MODE])  # the last one for NO_MODE itself
         successes, failures = (table[np.array([t.mode for t in part], dtype=int)] for part in parts)
-        parents = [new_modes.index(mode) if mode in new_modes else None for mode in range(len(names))]
+        parents = [new_modes.index(mode) if mode in new_modes else None for mode in range(len(numbers))]
         self.assign_modes(parts[0], successes, parts[1], failures, parents)
 
     def adopt_settings(self, other: "ModeReplayBuffer") -> None:

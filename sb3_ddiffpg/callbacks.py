@@ -6,6 +6,7 @@ import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_ddiffpg.history import ModeEvent
 from sb3_ddiffpg.trajectories import read_success
 
 
@@ -39,12 +40,12 @@ class ClusteringCallback(BaseCallback):
         if model.n_rollouts % frequency == 0:  # type: ignore[attr-defined]
             self.on_recluster(model.recluster())  # type: ignore[attr-defined]
 
-    def on_recluster(self, events: list[str]) -> None:
+    def on_recluster(self, events: list[ModeEvent]) -> None:
         """
         :param events: One entry for every mode that was born, split, merged or retired
         """
         if events and self.verbose >= 1:
-            print(f"[modes] step {self.num_timesteps}: {'; '.join(events)} -> {len(self.model.modes)} mode(s)")  # type: ignore[attr-defined]
+            print(f"[modes] step {self.num_timesteps}: {'; '.join(map(str, events))} -> {len(self.model.modes)} mode(s)")  # type: ignore[attr-defined]
 
     def _on_step(self) -> bool:
         return True

@@ -3,7 +3,6 @@
 import contextlib
 import io
 import pathlib
-import time
 import uuid
 import warnings
 from collections import defaultdict
@@ -25,15 +24,14 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, Behavior
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.callbacks import ClusteringCallback, contains_clustering
-from sb3_ddiffpg.clustering import cluster
 from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.features import declared_mode_features, same_selection
-from sb3_ddiffpg.interrupts import uninterrupted
+from sb3_ddiffpg.history import ModeHistory
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, noveld_reward
-from sb3_ddiffpg.modes import Mode, ModeTable, succeed
+from sb3_ddiffpg.mode_control import ModeControl
+from sb3_ddiffpg.modes import Mode, ModeTable, Outcome, default_name
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
 from sb3_ddiffpg.policies import DiffusionActor, DiffusionPolicy
-from sb3_ddiffpg.reclustering import Reclustering, find_modes
 from sb3_ddiffpg.target_actions import ascend
 from sb3_ddiffpg.trajectories import NO_MODE, Trajectory
 from sb3_ddiffpg.validation import check_arguments
@@ -41,7 +39,7 @@ from sb3_ddiffpg.validation import check_arguments
 SelfDDiffPG = TypeVar("SelfDDiffPG", bound="DDiffPG")
 
 
-class DDiffPG(OffPolicyAlgorithm):
+class DDiffPG(ModeControl, OffPolicyAlgorithm):
     """
     Deep Diffusion Policy Gradient (DDiffPG): learns several ways to solve one task.
 
@@ -90,6 +88,7 @@ class DDiffPG(OffPolicyAlgorithm):
     :param min_mode_size: Fewest goal-reached trajectories that make a mode
     :param mode_patience: Re-clusterings in a row that must find a mode within another before it is merged
     :param mode_trials: Commanded training episodes in a row that must miss a mode's route before it is retired
+    :param min_return_ratio: Least mean return of a mode's goal-reached trajectories, as a share of the best mode's
     :param max_successes_per_mode: Newest goal-reached trajectories that train a mode
     :param max_failures_per_mode: Newest failed trajectories that train a mode
     :param mode_embedding_dim: Size of a mode embedding
@@ -173,6 +172,7 @@ class DDiffPG(OffPolicyAlgorithm):
         min_mode_size: int = 5,
         mode_patience: int = 10,
         mode_trials: int = 200,
+        min_return_ratio: float = 0.0,
         max_successes_per_mode: int = 40,
         max_failures_per_mode: int = 20,
         mode_embedding_dim: int = 5,
@@ -248,6 +248,7 @@ class DDiffPG(OffPolicyAlgorithm):
         self.min_mode_size = min_mode_size
         self.mode_patience = mode_patience
         self.mode_trials = mode_trials
+        self.min_return_ratio = min_return_ratio
         self.max_successes_per_mode = max_successes_per_mode
         self.max_failures_per_mode = max_failures_per_mode
         self.mode_embedding_dim = mode_embedding_dim
@@ -271,6 +272,7 @@ class DDiffPG(OffPolicyAlgorithm):
         self.run_id = uuid.uuid4().hex  # whose modes are meant: every run has a "mode_0"
         self._modes: list[Mode] = []
         self._next_mode_number = 0
+        self.mode_history = ModeHistory()
         self._behavior = Behavior(0)
         self._resolved_features: Any = None
         self._warned_support = False
@@ -340,14 +342,6 @@ class DDiffPG(OffPolicyAlgorithm):
     def critics(self) -> ModeCritics:
         """The critics of all groups, see ``critics.ModeCritics``."""
         return self.policy.critics
-
-    @property
-    def modes(self) -> ModeTable:
-        """The modes discovered so far: iterate, index by name or number, or print."""
-        embeddings = self.policy.mode_embeddings[1:].cpu().numpy().copy()
-        for mode, embedding in zip(self._modes, embeddings, strict=True):
-            mode.embedding = embedding
-        return ModeTable(self._modes)
 
     # ------------------------------------------------------------------ learning
 
@@ -503,56 +497,6 @@ class DDiffPG(OffPolicyAlgorithm):
             self.logger.record(f"train/{name}", schedule(progress))
             update_learning_rate(optimizer, schedule(progress))
 
-    # ------------------------------------------------------------------ modes
-
-    def recluster(self) -> list[str]:
-        """
-        Algorithm 2 of the paper: cluster the goal-reached trajectories, let the new modes inherit from the old ones, and
-        assign the failed trajectories.
-
-        :return: One entry for every mode that was born, split, merged or retired
-        """
-        started = time.perf_counter()
-        with uninterrupted():
-            found = find_modes(
-                self.replay_buffer,
-                self._modes,
-                self._cluster,
-                self.min_mode_size,
-                self.max_modes,
-                self.mode_patience,
-                self.mode_trials,
-                births=self._exploration_share() > 0,
-            )
-            events = self._replace_modes(found)
-            found.describe(self._modes, self.replay_buffer)
-        self.logger.record("modes/n_modes", len(self._modes))
-        for mode in self._modes:
-            self.logger.record(f"modes/{mode.name}/n_trajectories", mode.n_trajectories)
-            self.logger.record(f"modes/{mode.name}/success_rate", mode.success_rate)
-        self.logger.record("time/recluster", time.perf_counter() - started)
-        return events
-
-    def _replace_modes(self, found: Reclustering) -> list[str]:
-        """Let buffer, policy, table and environments follow a re-clustering; what became of the modes."""
-        parents, kept = found.inheritance.parents, found.inheritance.kept
-        self.replay_buffer.assign_modes(
-            found.successes, found.labels, found.failures, found.failure_labels, parents, found.abandoned
-        )
-        self.policy.inherit(parents, kept, self.reset_new_critics)
-        old_names = [mode.name for mode in self._modes]
-        self._modes, events, self._next_mode_number = succeed(
-            self._modes, found.inheritance, self.num_timesteps, self._next_mode_number
-        )
-        names = [mode.name for mode in self._modes]
-        self._behavior.follow([names.index(name) if name in names else None for name in old_names])
-        return events
-
-    def _cluster(self, distances: np.ndarray) -> np.ndarray:
-        if self.max_modes == 1:
-            return np.zeros(len(distances), dtype=int)  # clustering off: whatever reaches the goal is the one mode
-        return cluster(distances, self.distance_threshold, self.linkage, self.max_modes, self.min_mode_size)
-
     # ------------------------------------------------------------------ acting
 
     def predict(
@@ -621,8 +565,8 @@ class DDiffPG(OffPolicyAlgorithm):
         for env, trajectory in replay_buffer.just_finished:
             mode = self._behavior.commanded_mode(env)
             if mode is not None:
-                trajectory.commanded = self._modes[mode].name
-                self._modes[mode].outcomes.append(trajectory.success)
+                trajectory.commanded = self._modes[mode].number
+                self._modes[mode].outcomes.append(Outcome(trajectory.success, trajectory.episode_return, trajectory.length))
                 self._modes[mode].unjudged += 1
             self._warn_outside_support(trajectory)
             self._behavior.begin(env, len(self._modes), self._exploration_share(), self.explore_then_exploit)
@@ -754,12 +698,9 @@ class DDiffPG(OffPolicyAlgorithm):
         super().set_parameters(params, exact_match, device)
 
     def _expect_unknown_modes(self, n_modes: int) -> None:
-        known = len(self._modes)
         self.policy.resize(n_modes)
-        first = self._next_mode_number
-        self._modes = [Mode(name=f"mode_{first + index}", born_at=self.num_timesteps) for index in range(n_modes)]
-        self._next_mode_number += n_modes
-        self._behavior.follow([None] * known)
+        numbers = range(self._next_mode_number, self._next_mode_number + n_modes)
+        self._hold([Mode(number, default_name(number), born_at=self.num_timesteps) for number in numbers])
         self.replay_buffer.expect_modes(n_modes)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
@@ -768,13 +709,13 @@ class DDiffPG(OffPolicyAlgorithm):
 
         :param path: Path to the file
         """
-        self.replay_buffer.owner = self.run_id, [mode.name for mode in self._modes]
+        self.replay_buffer.owner = self.run_id, [mode.number for mode in self._modes]
         super().save_replay_buffer(path)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
-        Load a replay buffer of this model's run, saved with it or at another time: trajectories follow the names of their
-        modes. What trains a mode stays as the model was made; size and unit of distances are those of the file.
+        Load a replay buffer of this model's run, saved with it or at another time: trajectories follow their modes. What
+        trains a mode stays as the model was made; size and unit of distances are those of the file.
 
         :param path: Path to the pickled replay buffer
         :param truncate_last_traj: Whether the next ``learn`` resets the environments and drops the episodes in progress
@@ -797,11 +738,11 @@ class DDiffPG(OffPolicyAlgorithm):
             raise ValueError(f"The replay buffer {path} {problem}")
         if previous is not None:
             loaded.adopt_settings(previous)
-        names = [mode.name for mode in self._modes]
-        if loaded.owner != (self.run_id, names):
-            loaded.renumber_modes([names.index(name) if name in names else NO_MODE for name in loaded.owner[1]], names)
-            # A mode that the file knows must not lend its name to another one
-            numbers = [int(name.removeprefix("mode_")) for name in loaded.owner[1] if name.removeprefix("mode_").isdigit()]
-            self._next_mode_number = max([self._next_mode_number, *(number + 1 for number in numbers)])
+        numbers = [mode.number for mode in self._modes]
+        if loaded.owner != (self.run_id, numbers):
+            loaded.follow_modes([numbers.index(each) if each in numbers else NO_MODE for each in loaded.owner[1]], numbers)
+            # A mode that the file knows must not lend its number to another one
+            self._next_mode_number = max([self._next_mode_number, *(number + 1 for number in loaded.owner[1])])
+        self._hold(self._modes)
         if truncate_last_traj:
             self._last_obs = None

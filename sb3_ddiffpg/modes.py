@@ -1,4 +1,4 @@
-"""Who is who among the modes: names that survive re-clustering, statistics, and the table behind ``model.modes``."""
+"""Who is who among the modes: numbers and names, statistics, and the table behind ``model.modes``."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -6,7 +6,28 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sb3_ddiffpg.clustering import Inheritance
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    A training episode that was commanded to a mode.
+
+    :param success: Whether it reached the goal, by whatever route
+    :param episode_return: Sum of its rewards
+    :param length: Number of steps
+    """
+
+    success: bool
+    episode_return: float
+    length: int
+
+
+def default_name(number: int) -> str:
+    """
+    :param number: A mode's number
+    :return: The name that it is born with
+    """
+    return f"mode_{number}"
 
 
 @dataclass(eq=False)
@@ -14,26 +35,30 @@ class Mode:
     """
     One discovered way to solve the task.
 
-    :param name: Kept for life, through re-clusterings, saving and loading
+    :param number: Counted up from 0 in each run; a mode keeps it for life, through re-clusterings, saving and loading
+    :param name: ``mode_<number>``, until ``DDiffPG.rename_mode`` gives it another
     :param born_at: Environment steps when it was discovered
     :param n_trajectories: Goal-reached trajectories that train it
     :param mean_length: Their mean length, in environment steps
     :param mean_return: Their mean undiscounted return
     :param representative: Mode features along the most central of them (the medoid), shape [length + 1, dim]
-    :param outcomes: Success of the latest training episodes that were commanded to this mode
+    :param frozen: Whether it is never merged, retired or crowded out, see ``DDiffPG.freeze_mode``
+    :param outcomes: The latest training episodes that were commanded to this mode
     :param doubts: Re-clusterings in a row that found it within another mode's cluster
     :param misses: Training episodes in a row that were commanded to it and did not reach the goal by its route
     :param unjudged: Commanded training episodes since the last clustering, which has not told yet by which route they went
     :param embedding: The vector that commands it; filled in by ``model.modes``, owned by the policy
     """
 
+    number: int
     name: str
     born_at: int
     n_trajectories: int = 0
     mean_length: float = float("nan")
     mean_return: float = float("nan")
     representative: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.float32), repr=False)
-    outcomes: deque[bool] = field(default_factory=lambda: deque(maxlen=100), repr=False)
+    frozen: bool = False
+    outcomes: deque[Outcome] = field(default_factory=lambda: deque(maxlen=100), repr=False)
     doubts: int = field(default=0, repr=False)
     misses: int = field(default=0, repr=False)
     unjudged: int = field(default=0, repr=False)
@@ -42,7 +67,20 @@ class Mode:
     @property
     def success_rate(self) -> float:
         """Share of successes among the latest (at most 100) training episodes commanded to it, noise included; or NaN."""
-        return float(np.mean(self.outcomes)) if self.outcomes else float("nan")
+        return self._mean("success")
+
+    @property
+    def expected_return(self) -> float:
+        """Mean undiscounted return of these episodes, failures included; or NaN."""
+        return self._mean("episode_return")
+
+    @property
+    def expected_length(self) -> float:
+        """Mean number of steps of these episodes, failures included; or NaN."""
+        return self._mean("length")
+
+    def _mean(self, name: str) -> float:
+        return float(np.mean([getattr(outcome, name) for outcome in self.outcomes])) if self.outcomes else float("nan")
 
 
 class ModeTable(Sequence[Mode]):
@@ -108,30 +146,3 @@ class ModeTable(Sequence[Mode]):
 
     def __repr__(self) -> str:
         return f"ModeTable({self.names})"
-
-
-def succeed(
-    old: Sequence[Mode], inheritance: Inheritance, step: int, first_free_number: int
-) -> tuple[list[Mode], list[str], int]:
-    """
-    The modes after a re-clustering: heirs keep name and record, newcomers get a name never used before.
-
-    :param old: Modes before
-    :param inheritance: Which new cluster follows which old mode
-    :param step: Environment steps so far
-    :param first_free_number: Number for the next new name
-    :return: The new modes, one line for each event (birth, split, merge, retirement), and the next free number
-    """
-    modes: list[Mode] = []
-    events: list[str] = []
-    number = first_free_number
-    for parent, kept in zip(inheritance.parents, inheritance.kept, strict=True):
-        if kept and parent is not None:
-            modes.append(old[parent])
-            continue
-        modes.append(Mode(name=f"mode_{number}", born_at=step))
-        events.append(f"{modes[-1].name} born" if parent is None else f"{modes[-1].name} split from {old[parent].name}")
-        number += 1
-    events += [f"{old[loser].name} merged into {modes[heir].name}" for loser, heir in sorted(inheritance.merged.items())]
-    events += [f"{old[gone].name} retired" for gone in sorted(inheritance.retired)]
-    return modes, events, number

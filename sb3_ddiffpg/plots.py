@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sb3_ddiffpg.evaluation import EpisodeResult
+from sb3_ddiffpg.episodes import EpisodeResult
 
 
 def plot_routes(episodes: Mapping[str, Sequence[EpisodeResult]], maze: Any = None) -> Any:

@@ -306,6 +306,27 @@ class DiffusionPolicy(BasePolicy):
 
     # ------------------------------------------------------------------ acting
 
+    @th.no_grad()
+    def group_values(self, obs: PyTorchObs, n_actions: int) -> th.Tensor:
+        """
+        What each group's critics expect of following that group, as the mean over actions drawn from the policy.
+
+        :param obs: N observations
+        :param n_actions: Actions drawn for each of them and each group
+        :return: Shape [G, N]
+        """
+        n_groups = self.critics.n_groups
+
+        def tile(part: th.Tensor) -> th.Tensor:
+            return th.cat([part.repeat_interleave(n_actions, 0)] * n_groups)
+
+        repeated = {key: tile(part) for key, part in obs.items()} if isinstance(obs, dict) else tile(obs)
+        features = self.critic_features(repeated)  # [G, N * n_actions, F]
+        embeddings = self.mode_embeddings.repeat_interleave(features.shape[1], 0)
+        actions = self.actor(repeated, embeddings=embeddings).unflatten(0, features.shape[:2])
+        values = self.critics.values(self.critics(features, actions)).min(dim=1).values
+        return values.unflatten(1, (-1, n_actions)).mean(dim=2)
+
     def critic_features(self, obs: PyTorchObs, target: bool = False) -> th.Tensor:
         """
         :param obs: Observations, G groups of n rows, [G * n, ...]

@@ -60,6 +60,7 @@ def find_modes(
     patience: int,
     trials: int,
     births: bool,
+    min_return_ratio: float = 0.0,
 ) -> Reclustering:
     """
     :param buffer: Holds the trajectories
@@ -70,10 +71,11 @@ def find_modes(
     :param patience: Re-clusterings in a row that must find a mode within another before it is merged
     :param trials: Commanded episodes in a row that must miss a mode's route before it is given up
     :param births: Whether modes may be born; the first always may
+    :param min_return_ratio: Least mean return of a mode, as a share of the best mode's
     :return: The new modes
     """
     given_up = _given_up(modes, trials) if buffer.has_success_signal else []
-    found, failures = _trajectories(buffer, {mode.name for index, mode in enumerate(modes) if index not in given_up})
+    found, failures = _trajectories(buffer, {mode.number for index, mode in enumerate(modes) if index not in given_up})
     abandoned = [trajectory for trajectory in found if trajectory.mode in given_up]
     successes = [trajectory for trajectory in found if trajectory.mode not in given_up]
     distances = np.zeros((len(successes), len(successes)), dtype=np.float32)
@@ -86,15 +88,17 @@ def find_modes(
     dormant = [mode for mode in _dormant(found, len(modes)) if mode not in given_up]
     old_labels = _old_labels(buffer, successes, modes, dormant, rng)
     labels = _defend(modes, distances, old_labels, labels, patience, max_modes)
+    returns = np.array([trajectory.episode_return for trajectory in successes])
+    labels = _worth_keeping(modes, returns, old_labels, labels, min_return_ratio, max_modes)
     if modes and not births:
         labels = _without_births(old_labels, labels, len(modes))
-    inheritance = _with_dormant(match_modes(old_labels, labels, len(modes), _count(labels)), dormant, max_modes)
+    inheritance = _with_dormant(match_modes(old_labels, labels, len(modes), _count(labels)), modes, dormant, max_modes)
 
     for mode in modes:
         mode.misses, mode.unjudged = mode.misses + mode.unjudged, 0
-    told = {modes[old].name: new for new, old in enumerate(inheritance.parents) if old is not None and inheritance.kept[new]}
+    told = {modes[old].number: new for new, old in enumerate(inheritance.parents) if old is not None and inheritance.kept[new]}
     for trajectory, label in zip(successes, labels.tolist(), strict=True):
-        if trajectory.mode == NO_MODE and label != NO_MODE and told.get(trajectory.commanded or "") == label:
+        if trajectory.mode == NO_MODE and label != NO_MODE and _told(told, trajectory) == label:
             modes[inheritance.parents[label]].misses = 0
     failure_labels = _share_out(buffer, failures, successes, labels, told, rng)
     found_modes = Reclustering(successes, labels, distances, failures, failure_labels, abandoned, inheritance)
@@ -105,16 +109,21 @@ def _count(labels: np.ndarray) -> int:
     return int(labels.max(initial=NO_MODE)) + 1
 
 
+def _told(told: dict[int, int], trajectory: Trajectory) -> int:
+    """New index of the mode that the trajectory was told to follow, ``NO_MODE`` if there was none or it has ended."""
+    return NO_MODE if trajectory.commanded is None else told.get(trajectory.commanded, NO_MODE)
+
+
 def _share_out(
     buffer: ModeReplayBuffer,
     failures: list[Trajectory],
     successes: list[Trajectory],
     labels: np.ndarray,
-    told: dict[str, int],
+    told: dict[int, int],
     rng: np.random.RandomState,
 ) -> np.ndarray:
     """New mode of every failure. A mode must see its own; those of nobody are shared out by likeness, as in the paper."""
-    failure_labels = np.array([told.get(failure.commanded or "", NO_MODE) for failure in failures], dtype=int)
+    failure_labels = np.array([_told(told, failure) for failure in failures], dtype=int)
     strayed = np.flatnonzero([failure.commanded not in told and not failure.foreign for failure in failures])
     if _count(labels) and len(strayed):
         members = [[buffer.path(successes[i]) for i in np.flatnonzero(labels == mode)] for mode in range(_count(labels))]
@@ -144,7 +153,8 @@ def _defend(
         members = np.flatnonzero(old_labels == old)
         within_another = old in inheritance.merged
         modes[old].doubts += within_another
-        if modes[old].doubts > patience or n_new >= max_modes or not len(members):
+        gives_way = modes[old].doubts > patience or n_new >= max_modes
+        if not len(members) or (gives_way and not modes[old].frozen):
             continue
         if within_another:
             host = labels == inheritance.merged[old]
@@ -158,10 +168,32 @@ def _defend(
     return labels
 
 
-def _trajectories(buffer: ModeReplayBuffer, names: set[str]) -> tuple[list[Trajectory], list[Trajectory]]:
+def _worth_keeping(
+    modes: Sequence[Mode],
+    returns: np.ndarray,
+    old_labels: np.ndarray,
+    labels: np.ndarray,
+    min_return_ratio: float,
+    max_modes: int,
+) -> np.ndarray:
+    """Labels without the clusters that return too little, nor the smallest of too many. Frozen modes stay."""
+    kept = match_modes(old_labels, labels, len(modes), _count(labels))
+    frozen = [new for new, old in enumerate(kept.parents) if old is not None and kept.kept[new] and modes[old].frozen]
+    others = [new for new in range(_count(labels)) if new not in frozen]
+    mean = {new: returns[labels == new].mean() for new in [*frozen, *others]}
+    best = max(mean.values(), default=0.0)
+    worth = [new for new in others if best <= 0 or mean[new] >= min_return_ratio * best]
+    worth.sort(key=lambda new: -np.count_nonzero(labels == new))
+    stay = sorted([*frozen, *worth[: max(0, max_modes - len(frozen))]])
+    numbers = np.full(_count(labels) + 1, NO_MODE)  # the last for NO_MODE itself
+    numbers[stay] = np.arange(len(stay))
+    return numbers[labels]
+
+
+def _trajectories(buffer: ModeReplayBuffer, numbers: set[int]) -> tuple[list[Trajectory], list[Trajectory]]:
     """Goal-reached and failed trajectories, in order of finishing; those foreign to a mode count as failed while it lives."""
     successes, failures = buffer.trajectories(success=True), buffer.trajectories(success=False)
-    homeless = [trajectory for trajectory in failures if trajectory.foreign and trajectory.commanded not in names]
+    homeless = [trajectory for trajectory in failures if trajectory.foreign and trajectory.commanded not in numbers]
     for trajectory in homeless:
         buffer.readmit(trajectory)
     successes = sorted([*successes, *homeless], key=lambda trajectory: trajectory.serial)
@@ -170,7 +202,7 @@ def _trajectories(buffer: ModeReplayBuffer, names: set[str]) -> tuple[list[Traje
 
 def _given_up(modes: Sequence[Mode], trials: int) -> list[int]:
     """Modes that cannot be commanded: a clump of wanderings, or a copy of another mode. Unless that is true of all."""
-    missing = [index for index, mode in enumerate(modes) if mode.misses >= trials]
+    missing = [index for index, mode in enumerate(modes) if mode.misses >= trials and not mode.frozen]
     return missing if len(missing) < len(modes) else []
 
 
@@ -187,7 +219,7 @@ def _without_births(old_labels: np.ndarray, labels: np.ndarray, n_old: int) -> n
     return labels
 
 
-def _foreign_apart(buffer: ModeReplayBuffer, found: Reclustering, told: dict[str, int]) -> Reclustering:
+def _foreign_apart(buffer: ModeReplayBuffer, found: Reclustering, told: dict[int, int]) -> Reclustering:
     """
     The new trajectories that were told to follow one mode, but took the route of another, made failures of the first. Seen as
     successes they would tell its critic that any route will do, and the policy of a longer route would drift to the
@@ -199,7 +231,7 @@ def _foreign_apart(buffer: ModeReplayBuffer, found: Reclustering, told: dict[str
     established = {new for new, is_kept in enumerate(found.inheritance.kept) if is_kept}
     foreign: dict[int, int] = {}
     for i, trajectory in enumerate(successes):
-        mode = told.get(trajectory.commanded or "", NO_MODE)
+        mode = _told(told, trajectory)
         has_route = mode != NO_MODE and mode in labels  # a dormant mode has none yet that one could leave
         if trajectory.mode == NO_MODE and has_route and labels[i] in established - {mode}:
             foreign[i] = mode
@@ -241,10 +273,12 @@ def _old_labels(
     return labels
 
 
-def _with_dormant(inheritance: Inheritance, dormant: list[int], max_modes: int) -> Inheritance:
+def _with_dormant(inheritance: Inheritance, modes: Sequence[Mode], dormant: list[int], max_modes: int) -> Inheritance:
     """A mode without data stays as it is until it has some, where there is room: it can still be commanded."""
     heirs = {parent for parent, kept in zip(inheritance.parents, inheritance.kept, strict=True) if kept}
-    waiting = [mode for mode in dormant if mode not in heirs][: max(0, max_modes - len(inheritance.parents))]
+    waiting = sorted((mode for mode in dormant if mode not in heirs), key=lambda mode: not modes[mode].frozen)
+    n_frozen = sum(modes[mode].frozen for mode in waiting)
+    waiting = waiting[: max(n_frozen, max_modes - len(inheritance.parents))]
     return Inheritance(
         parents=[*inheritance.parents, *waiting],
         kept=[*inheritance.kept, *(True for _ in waiting)],

@@ -23,7 +23,7 @@ class Trajectory:
     :param serial: Running number in order of finishing
     :param mode: Index of the mode that owns it, ``NO_MODE`` before the first clustering or for an outlier
     :param trains: Whether the mode learns from it, or only remembers it for the next clustering
-    :param commanded: Name of the mode that it was told to follow, None if none
+    :param commanded: Number of the mode that it was told to follow, None if none
     :param foreign: It followed a command to its mode, but reached the goal by another mode's route: its mode is shown it as
         a failure, so that it learns to keep to its own
     :param path: Mode features resampled to equal steps, shape [n_path_points, dim]; made when first needed
@@ -35,7 +35,7 @@ class Trajectory:
     serial: int
     mode: int = NO_MODE
     trains: bool = False
-    commanded: str | None = None
+    commanded: int | None = None
     foreign: bool = False
     path: np.ndarray | None = field(default=None, repr=False)
 

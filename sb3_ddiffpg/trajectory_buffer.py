@@ -72,6 +72,8 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         self._groups: dict[tuple[int, bool], deque[Trajectory]] = {}
         self._group_rows: dict[tuple[int, bool], int] = {}
         self._retired: deque[Trajectory] = deque()
+        #: Indices of modes whose successes are evicted last
+        self.frozen_modes: set[int] = set()
         self._n_finished = 0
         self._last_rows = np.empty(0, dtype=np.int32)
         self._success_rule = SuccessRule(self.success_key)
@@ -155,6 +157,7 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         else:
             # The last success of a mode stays: without it the mode would have nothing to learn from
             spare = [key for key, group in self._groups.items() if len(group) > (key[0] != NO_MODE and key[1])]
+            spare = [key for key in spare if not (key[0] in self.frozen_modes and key[1])] or spare
             if not spare:
                 raise ValueError(
                     f"buffer_size={self.buffer_size} transitions is too small: the unfinished episodes of {self.n_envs} "

@@ -17,3 +17,19 @@ def trained():
     model.learn(400)
     assert len(model.modes) == 2
     return model
+
+
+@pytest.fixture
+def two_routes():
+    """Up and down are modes, and their critics were trained a little."""
+    from planar import planar_model, route_of, said, walk
+
+    model = planar_model()
+    walk(model, "up", 4)
+    walk(model, "down", 5)
+    assert said(model) == ["mode_0 born", "mode_1 born"]
+    model._setup_learn(1)
+    model.train(5, 32)
+    names = {route_of(mode): mode.name for mode in model.modes}
+    assert names == {"down": "mode_0", "up": "mode_1"}  # the larger one first
+    return model

@@ -13,7 +13,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 
 from sb3_ddiffpg import ClusteringCallback, DDiffPG
-from sb3_ddiffpg.evaluation import run_episodes
+from sb3_ddiffpg.episodes import run_episodes
 
 NUMBERS_FROM_ONE = (
     *("n_diffusion_steps", "n_action_gradient_steps", "n_critics", "n_atoms", "mode_n_steps", "exploration_n_steps"),

@@ -1,175 +1,171 @@
-"""Complete episodes, and their picture."""
+"""Counting modes: the numbers against hand and chance, and what is counted when."""
+
+import json
+import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from environments import WIDE, AnySpaces, TwoEnds, small_model
+from environments import AnySpaces, TwoEnds, small_model
 from gymnasium import spaces
-from maze_routes import ROUTES
-from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import TD3
+from stable_baselines3.common.vec_env import DummyVecEnv
+from test_episodes import Scripted
 
-from sb3_ddiffpg import ModeEvalCallback
 from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.evaluation import run_episodes
-from sb3_ddiffpg.plots import plot_routes
+from sb3_ddiffpg.evaluation import CommandResult, ModeEvaluation, WayResult, evaluate_modes
 
 
-class Scripted:
-    """Goes to the goal of V1 round the block, above or below as it is told, or runs into the wall for ever."""
-
-    def __init__(self) -> None:
-        self.commands: list = []
-
-    def predict(self, obs, state=None, episode_start=None, deterministic=False, mode=None):
-        self.commands.append(mode)
-        side = {"above": 1.0, "below": -1.0, "nowhere": 0.0}[mode]
-        x, y = obs[:, 0], obs[:, 1]
-        leave = (x > -2.0) & (np.abs(y) < 3.5)
-        back = x < -6.5
-        action = np.stack([np.where(leave & (side != 0), 0.0, -1.0), np.where(leave, side, 0.0)], axis=1)
-        action[back] = np.clip(np.stack([-8.0 - x[back], -y[back]], axis=1), -1, 1)
-        return action.astype(np.float32), state
+def result(mode, n, labels):
+    return CommandResult(mode, n, sum(labels.values()), 10.0, 1.0, labels)
 
 
-@pytest.mark.parametrize(("mode", "label"), [("above", "0:a"), ("below", "0:-")])
-def test_episodes_are_complete_and_carry_their_route(mode, label):
-    model = Scripted()
-    env = make_vec_env("PointMazeV1-v0", 3, seed=0, start_noise=0.0)
-    episodes = run_episodes(model, env, 7, mode=mode)
-    assert len(episodes) == 7 and set(model.commands) == {mode}
-    for episode in episodes:
-        assert episode.success and episode.label == label and episode.episode_return == 1.0
-        assert episode.path.shape == (episode.length + 1, 2)
-        np.testing.assert_allclose(episode.path[0], [0, 0])
-        assert np.linalg.norm(episode.path[-1] - [-8, 0]) <= 1.0  # the terminal position, not the next start
-        assert np.abs(np.diff(episode.path, axis=0)).max() <= 0.8 + 1e-6
-    assert ("V1", label) in ROUTES
+def evaluation(labels, n, commanded=(), listed=()):
+    names = list(dict.fromkeys([*labels, *(label for each in commanded for label in each.labels)]))
+    ways = tuple(WayResult(name, 1, 1.0, 1.0) for name in names)
+    return ModeEvaluation("any", "environment", tuple(listed), 0.0, result(None, n, labels), tuple(commanded), ways)
 
 
-def test_failures_last_until_the_time_limit():
-    env = make_vec_env("PointMazeV1-v0", 2, seed=0, start_noise=0.0)
-    episodes = run_episodes(Scripted(), env, 2, mode="nowhere")
-    assert [(e.success, e.label, e.length, e.episode_return) for e in episodes] == [(False, None, 150, 0.0)] * 2
+# ---------------------------------------------------------------------- the numbers
 
 
-def test_short_episodes_are_not_favoured():
-    """Every environment contributes the same number, however long its episodes are."""
-
-    class Mixed(Scripted):
-        def predict(self, obs, **kwargs):
-            fast = super().predict(obs, mode="above")[0]
-            fast[1] = [1.0, 0.0]  # environment 1 never arrives
-            return fast, None
-
-    env = make_vec_env("PointMazeV1-v0", 2, seed=0, start_noise=0.0)
-    assert [episode.success for episode in run_episodes(Mixed(), env, 6)] == [True] * 3 + [False] * 3
-
-
-def test_paths_are_in_metres_behind_a_normalising_wrapper():
-    """The terminal observation too, which VecNormalize hides in ``info``."""
-    plain = make_vec_env("PointMazeV1-v0", 2, seed=0, start_noise=0.0)
-    normalised = VecNormalize(make_vec_env("PointMazeV1-v0", 2, seed=0, start_noise=0.0))
-
-    class Unnormalising(Scripted):
-        def predict(self, obs, **kwargs):
-            return super().predict(normalised.get_original_obs(), **kwargs)
-
-    expected = run_episodes(Scripted(), plain, 4, mode="above")
-    for episode, same in zip(run_episodes(Unnormalising(), normalised, 4, mode="above"), expected, strict=True):
-        np.testing.assert_allclose(episode.path, same.path, atol=1e-4)
-        assert episode.episode_return == same.episode_return == 1.0
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=5), st.integers(0, 40), st.integers(1, 30), st.integers(0, 2**20))
+def test_expected_modes_are_the_mean_of_drawing(counts, n_failed, n_draws, seed):
+    n = sum(counts) + n_failed
+    labels = np.repeat([*range(len(counts)), -1], [*counts, n_failed])
+    rng = np.random.default_rng(seed)
+    drawn = [set(rng.choice(labels, size=min(n_draws, n), replace=False)) - {-1} for _ in range(2000)]
+    sizes = np.array([len(each) for each in drawn])
+    expected = evaluation({str(k): count for k, count in enumerate(counts)}, n).expected_modes(n_draws)
+    assert expected == pytest.approx(sizes.mean(), abs=5 * sizes.std() / np.sqrt(2000) + 0.005)
 
 
-class Labelled(TwoEnds):
-    """Says at an episode's end which end it was; the left one only counts as one mode more if it is reached."""
+def test_expected_modes_by_hand():
+    assert evaluation({"a": 100, "b": 100}, 200).expected_modes() == pytest.approx(2.0, abs=1e-5)
+    assert evaluation({"a": 1}, 200).expected_modes() == pytest.approx(20 / 200)
+    assert evaluation({"a": 7, "b": 1}, 10).expected_modes() == 2.0  # all ten are drawn
+    assert evaluation({}, 10).expected_modes() == 0.0
 
-    def step(self, action):
-        observation, reward, terminated, truncated, info = super().step(action)
-        return observation, reward, terminated, truncated, {**info, "mode": "left" if self.x < 0 else "right"}
 
-
-@pytest.mark.parametrize("success_key", ["is_success", "success"])
-def test_evaluation_during_training_counts_modes(success_key):
-    """Against SB3's own counts, and the labels as they go by."""
-    logged, ended = [], []
-
-    class Watched(Labelled):
-        def step(self, action):
-            *rest, terminated, truncated, info = super().step(action)
-            if terminated or truncated:
-                ended.append(info["mode"] if terminated else None)
-            return *rest, terminated, truncated, info
-
-    class Recorder(KVWriter):
-        def write(self, key_values, key_excluded, step=0):
-            if "eval/n_modes" in key_values:
-                logged.append((key_values["eval/n_modes"], key_values.get("eval/success_rate"), list(ended)))
-                ended.clear()
-
-        def close(self):
-            pass
-
-    model = small_model(DummyVecEnv([TwoEnds] * 4))
-    model.set_logger(Logger(None, [Recorder()]))
-    callback = ModeEvalCallback(
-        DummyVecEnv([lambda: Watched(success_key)]), eval_freq=10, n_eval_episodes=3, verbose=0, warn=False
+def test_robust_and_effective_modes():
+    found = evaluation({"a": 95, "b": 95, "c": 10, "d": 9}, 209, listed=("a", "c", "x", "y"))
+    assert found.robust_modes == 2 and found.coverage == 0.25  # 5 % of 209 are 10.45
+    assert evaluation({"a": 90, "b": 10}, 200).robust_modes == 2
+    assert evaluation({name: 25 for name in "abcd"}, 200).effective_modes == pytest.approx(4.0)
+    assert evaluation({"a": 7}, 10).effective_modes == pytest.approx(1.0)
+    assert evaluation({"a": 3, "b": 1}, 8).effective_modes == pytest.approx(
+        math.exp(0.75 * math.log(4 / 3) + 0.25 * math.log(4))
     )
-    assert not callback.deterministic
-    model.learn(400, callback=callback)
-    assert len(logged) == 10 and len({n_modes for n_modes, _, _ in logged}) > 1
-    for n_modes, success_rate, labels in logged:
-        assert len(labels) == 3 and n_modes == len(set(labels) - {None})
-        if success_key == "is_success":  # SB3 knows no other
-            assert success_rate == pytest.approx(np.mean([label is not None for label in labels]))
-    # Where nobody says, nothing is counted
-    silent = ModeEvalCallback(DummyVecEnv([TwoEnds]), eval_freq=20, n_eval_episodes=2, verbose=0, warn=False)
-    model.learn(100, callback=silent)
-    assert len(logged) == 10
+    nothing = evaluation({}, 10)
+    assert (nothing.robust_modes, nothing.effective_modes) == (0, 0.0) and math.isnan(nothing.coverage)
 
 
-@pytest.mark.parametrize(("success_key", "said"), [("solved", True), (None, None)])
-def test_success_is_what_the_model_was_told_to_look_for(success_key, said):
-    env = DummyVecEnv([lambda: TwoEnds(success_key)] * 3)
-
-    class Rightwards:
-        def predict(self, obs, **kwargs):
-            return np.ones((len(obs), 1)), None
-
-    model = Rightwards()
-    model.success_key = success_key
-    assert [episode.success for episode in run_episodes(model, env, 6)] == [said] * 6
+@pytest.mark.parametrize(("successes", "n"), [(0, 20), (20, 20), (13, 20), (95, 100)])
+def test_wilson_interval(successes, n):
+    z, p = 1.959963985, successes / n
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    assert result("m", n, {"a": successes}).success_interval == pytest.approx((centre - half, centre + half), abs=1e-7)
 
 
-def test_numbers_as_observations():
-    class Number(AnySpaces):
-        def reset(self, **kwargs):
-            return int(super().reset(**kwargs)[0]), {}
-
-        def step(self, action):
-            observation, *rest = super().step(action)
-            return (int(observation), *rest)
-
-    env = DummyVecEnv([lambda: Number(spaces.Discrete(5))] * 2)
-    model = small_model(env, **WIDE)
-    assert [len(episode.path) == episode.length + 1 for episode in run_episodes(model, env, 4)] == [True] * 4
+def test_control():
+    rows = (result("one", 10, {"b": 9, "a": 1}), result("two", 10, {"a": 6, "b": 2}), result("three", 10, {"b": 10}))
+    found = evaluation({}, 10, rows)
+    assert found.labels == ["b", "a"]
+    np.testing.assert_array_equal(found.confusion, [[9, 1, 0], [2, 6, 2], [10, 0, 0]])
+    # "b" can be the own way of one of them only
+    assert found.matching == {"two": "a", "three": "b"} and found.control_accuracy == pytest.approx(16 / 30)
+    assert found.commandable == ["b"]
+    assert math.isnan(evaluation({"a": 3}, 10).control_accuracy) and evaluation({"a": 3}, 10).matching == {}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "name"), [((TwoEnds(), 2), "env"), ((None, 0), "n_episodes"), ((None, 7.0), "n_episodes")]
-)
-def test_bad_arguments(arguments, name):
-    env = arguments[0] or DummyVecEnv([TwoEnds])
-    with pytest.raises(ValueError, match=f"{name} must be"):
-        run_episodes(Scripted(), env, arguments[1])
+# ---------------------------------------------------------------------- running them
 
 
-def test_routes_are_drawn_over_the_maze():
-    env = make_vec_env("PointMazeV1-v0", 2, seed=0, start_noise=0.0)
-    model = Scripted()
-    episodes = {mode: run_episodes(model, env, 2, mode=mode) for mode in ("above", "nowhere")}
-    figure = plot_routes(episodes, maze=env.get_attr("maze", indices=0)[0])
-    lines = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 1]
-    assert [line.get_linestyle() for line in lines] == ["-", "-", "--", "--"]
-    assert lines[0].get_color() == lines[1].get_color() != lines[2].get_color()
-    np.testing.assert_allclose(lines[0].get_xydata(), episodes["above"][0].path)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["start", "above", "nowhere"]
+class Two(Scripted):
+    """Has two modes; uncommanded it goes above in three of four episodes."""
+
+    modes = (SimpleNamespace(name="above"), SimpleNamespace(name="below"))
+
+    def predict(self, obs, state=None, mode=None, **kwargs):
+        if mode is not None:
+            return super().predict(obs, mode=mode)
+        upper = super().predict(obs, mode="above")[0]
+        upper[::4] = super().predict(obs, mode="below")[0][::4]
+        return upper, state
+
+
+def test_a_maze():
+    found = evaluate_modes(Two(), "PointMazeV1-v0", 8, seed=0)
+    assert (found.env_id, found.label_source, found.listed) == ("PointMazeV1-v0", "environment", ("0:-", "0:a"))
+    assert [(each.mode, each.n_episodes, each.labels) for each in found.commanded] == [
+        ("above", 8, {"0:a": 8}),
+        ("below", 8, {"0:-": 8}),
+    ]
+    assert found.uncommanded.n_episodes == 16 and found.uncommanded.labels == {"0:a": 12, "0:-": 4}
+    assert found.start_spread == 0.0 and found.control_accuracy == 1.0 and found.coverage == 1.0
+    assert [way.label for way in found.ways] == ["0:a", "0:-"] and found.ways[0].n_episodes == 20
+    assert all(1.0 <= way.path_ratio < 1.01 and 15 < way.mean_length < 40 for way in found.ways)
+    lines = str(found).splitlines()
+    assert lines[1].split()[:2] == ["above", "8/8"] and lines[3].startswith("(none)") and "100.0%" in lines[5]
+    below = evaluate_modes(Two(), "PointMazeV1-v0", 4, n_uncommanded=4, modes=["below"], seed=0)
+    assert [each.mode for each in below.commanded] == ["below"] and below.uncommanded.n_episodes == 4
+
+
+def test_different_starts_are_told():
+    env = make_vec_env("PointMazeV1-v0", 4, seed=0, start_noise=0.4)
+    found = evaluate_modes(Two(), env, 4)
+    assert 0.2 < found.start_spread < 1.2
+    assert f"Episodes start up to {found.start_spread:.3g} apart" in str(found)
+
+
+def test_other_algorithms_have_one_way_at_most():
+    model = TD3("MlpPolicy", make_vec_env("PointMazeV1-v0", 1), buffer_size=10, policy_kwargs={"net_arch": [8]})
+    found = evaluate_modes(model, "PointMazeV1-v0", 2, max_episode_steps=30)
+    assert found.commanded == () and found.uncommanded.n_episodes == 4 and len(found.ways) <= 1
+    assert math.isnan(found.control_accuracy) and "control accuracy -" in str(found)
+
+
+def test_where_nobody_labels_ways_are_clusters(trained):
+    env = DummyVecEnv([TwoEnds] * 4)
+    found = evaluate_modes(trained, env, 8, seed=0)
+    assert found.label_source == "clustering" and "gives no labels" in str(found)
+    assert {label.split()[0] for label in found.labels} <= {"cluster", "other"} and len(found.labels) >= 1
+    assert [each.mode for each in found.commanded] == trained.modes.names
+
+
+def test_without_word_of_success_every_episode_counts():
+    env = DummyVecEnv([lambda: AnySpaces(spaces.Box(-1.0, 1.0, (2,)))] * 2)
+    found = evaluate_modes(small_model(env), env, 3)
+    assert found.uncommanded.n_successes == found.uncommanded.n_episodes == 6
+
+
+def test_json(tmp_path):
+    found = evaluate_modes(Two(), "PointMazeV1-v0", 4, seed=0)
+    found = replace(found, commanded=(*found.commanded, CommandResult("lost", 4, 0, float("nan"), 0.0, {})))
+    found.save(tmp_path / "found.json")
+    data = json.loads((tmp_path / "found.json").read_text(), parse_constant=pytest.fail)
+    assert data["summary"]["robust_modes"] == 2 and data["commanded"][2]["mean_length"] is None
+    again = ModeEvaluation.load(tmp_path / "found.json")
+    assert str(again) == str(found) and again.uncommanded == found.uncommanded and again.ways == found.ways
+    (tmp_path / "other.json").write_text('{"format": 0}')
+    with pytest.raises(ValueError, match="is no evaluation of modes in format 1"):
+        ModeEvaluation.load(tmp_path / "other.json")
+
+
+def test_seed_reproduces(trained):
+    first, second = (evaluate_modes(trained, DummyVecEnv([TwoEnds] * 3), 6, seed=4) for _ in range(2))
+    assert first == second
+
+
+def test_bad_arguments():
+    with pytest.raises(ValueError, match=r"modes: 'left' given; the model's modes are \['above', 'below'\]"):
+        evaluate_modes(Two(), "PointMazeV1-v0", 4, modes=["left"])
+    with pytest.raises(ValueError, match="n_episodes must be an integer of at least 1"):
+        evaluate_modes(Two(), make_vec_env("PointMazeV1-v0", 1), 0)
+    with pytest.raises(ValueError, match=r"\['maze_map'\] given; accepted beside an env"):
+        evaluate_modes(Two(), make_vec_env("PointMazeV1-v0", 1), 1, maze_map="V2")

@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 from scipy.spatial.transform import Rotation
 from stable_baselines3.common.env_checker import check_env as check_sb3_env
 
-from sb3_ddiffpg.envs.franka.tasks import FrankaCabinetOpen, FrankaDrawerClose, FrankaPegInHole, FrankaReach
+from sb3_ddiffpg.envs.franka.tasks import QUARTERS, FrankaCabinetOpen, FrankaDrawerClose, FrankaPegInHole, FrankaReach
 
 IDS = ["FrankaReach-v0", "FrankaPegInHole-v0", "FrankaDrawerClose-v0", "FrankaCabinetOpen-v0"]
 DOWNWARDS, FORWARDS = Rotation.from_euler("xyz", [np.pi, 0, 0]), Rotation.from_euler("xyz", [np.pi, -np.pi / 2, 0])
@@ -82,7 +82,6 @@ def pull(mode):
     return follow([(-0.5, -0.2, z), (-0.3, -0.18, z), (-0.3, 0.05, z), (-0.4, 0.1, z), (-0.65, 0.1, z)], inwards, near=0.08)
 
 
-QUARTERS = ["left-up", "left-down", "right-up", "right-down"]
 SOLUTIONS = [
     *((FrankaReach, reach, mode) for mode in QUARTERS),
     *((FrankaPegInHole, insert, mode) for mode in ("left", "right")),
@@ -173,6 +172,22 @@ def test_a_copy_goes_on_from_where_it_was_made(env_id):
         np.testing.assert_array_equal(other.reset()[0], start)
         other.close()
     env.close()
+
+
+def test_start_noise():
+    env = FrankaPegInHole(obs_joints=True, start_noise=0.0)
+    starts = [env.reset(seed=seed)[0] for seed in range(2)]
+    np.testing.assert_array_equal(*starts)
+    np.testing.assert_array_equal(starts[0][-7:], np.float32(env.start_angles))
+    with pytest.raises(ValueError, match="start_noise: -1 given"):
+        FrankaReach(start_noise=-1)
+    env.close()
+
+
+def test_the_listed_ways_are_those_that_scripts_go():
+    assert {task: task.listed_modes for task, _, _ in SOLUTIONS} == {
+        task: tuple(mode for each, _, mode in SOLUTIONS if each is task) for task, _, _ in SOLUTIONS
+    }
 
 
 def test_a_joint_turns_by_at_most_what_the_action_says():

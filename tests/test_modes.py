@@ -7,20 +7,15 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch as th
-from environments import AnySpaces, TwoEnds, fill, small_model, some_observations
-from gymnasium import spaces
-from maze_routes import polyline
+from environments import TwoEnds, fill, small_model, some_observations
+from planar import ROUTES, belongings, planar_model, route_of, said, same, walk
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import Mode, ModeTable
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, UNCONDITIONED, Behavior
+from sb3_ddiffpg.modes import Outcome
 from sb3_ddiffpg.trajectories import NO_MODE
-
-# Three ways of the same length to three places
-ROUTES = {"up": [(0, 0), (0, 6), (6, 6)], "down": [(0, 0), (0, -6), (6, -6)], "right": [(0, 0), (12, 0)]}
-PLANE = spaces.Box(-20.0, 20.0, (2,))
-
 
 # ---------------------------------------------------------------------- commanding
 
@@ -161,16 +156,17 @@ def test_without_modes_nothing_is_commanded():
 
 def test_table():
     modes = [
-        Mode("mode_3", born_at=100, n_trajectories=12, mean_length=21.25, mean_return=1.0),
-        Mode("mode_0", born_at=7, n_trajectories=4),
+        Mode(3, "mode_3", born_at=100, n_trajectories=12, mean_length=21.25, mean_return=1.0),
+        Mode(0, "mode_0", born_at=7, n_trajectories=4),
     ]
-    modes[0].outcomes.extend([True, True, False, True])
+    modes[0].outcomes.extend(Outcome(success, 2.0 * success, 10) for success in (True, True, False, True))
     table = ModeTable(modes)
     assert len(table) == 2 and list(table) == modes and table.names == ["mode_3", "mode_0"]
     assert table["mode_0"] is table[1] is table[-1] is modes[1] and table[:1] == modes[:1]
     assert table.index("mode_0") == 1 and table.index(0) == 0
-    assert "mode_0" in table and "mode_1" not in table and modes[1] in table and Mode("mode_0", born_at=7) not in table
+    assert "mode_0" in table and "mode_1" not in table and modes[1] in table and Mode(0, "mode_0", born_at=7) not in table
     assert table[0].success_rate == 0.75 and np.isnan(table[1].success_rate)
+    assert (table[0].expected_return, table[0].expected_length) == (1.5, 10) and np.isnan(table[1].expected_return)
     lines = str(table).splitlines()
     assert [line.split()[0] for line in lines] == ["mode", "mode_3", "mode_0"]
     assert lines[1].split()[1:] == ["12", "0.75", "21.2", "1.00"] and lines[2].split()[1:3] == ["4", "-"]
@@ -178,7 +174,7 @@ def test_table():
     assert repr(table) == "ModeTable(['mode_3', 'mode_0'])"
     with pytest.raises(ValueError, match="'mode_9' is unknown"):
         table["mode_9"]
-    modes[0].outcomes.extend([False] * 100)
+    modes[0].outcomes.extend([Outcome(False, 0.0, 10)] * 100)
     assert table[0].success_rate == 0.0  # of the latest 100
 
 
@@ -194,55 +190,6 @@ def test_records_are_snapshots(trained):
 # ---------------------------------------------------------------------- re-clustering
 
 
-def planar_model(**changes):
-    settings = {"mode_features": [0, 1], "distance_threshold": 2.0, "mode_patience": 0, "buffer_size": 5000}
-    return small_model(AnySpaces(PLANE), **(settings | changes))
-
-
-def walk(model, route, n, success=True, part=1.0):
-    """The model's environment takes a route n times (or fails on the way)."""
-    rng = np.random.default_rng(len(model.replay_buffer.trajectories(True)))
-    for _ in range(n):
-        line = polyline(ROUTES[route], step=1.0) + rng.uniform(-0.3, 0.3, 2)
-        line = line[: int(part * len(line))] + rng.normal(scale=0.1, size=(int(part * len(line)), 2))
-        fill(model.replay_buffer, [line.astype(np.float32)], success)
-
-
-def route_of(mode):
-    end = mode.representative[-1]
-    return min(ROUTES, key=lambda route: np.abs(ROUTES[route][-1] - end).sum())
-
-
-def belongings(model):
-    """By name: embedding, critics, their targets and moments."""
-    critics = model.critics
-    state = {}
-    for index, mode in enumerate(model.modes):
-        weights = [parameter[index + 1].detach().clone() for parameter in critics.stacked_parameters()]
-        targets = [p[index + 1].detach().clone() for p in model.policy.critics_target.stacked_parameters()]
-        moments = [critics.optimizer.state[p]["exp_avg"][index + 1].clone() for p in critics.stacked_parameters()]
-        state[mode.name] = [th.as_tensor(mode.embedding), *weights, *targets, *moments]
-    return state
-
-
-def same(first, second):
-    return all(th.equal(a, b) for a, b in zip(first, second, strict=True))
-
-
-@pytest.fixture
-def two_routes():
-    """Up and down are modes, and their critics were trained a little."""
-    model = planar_model()
-    walk(model, "up", 4)
-    walk(model, "down", 5)
-    assert model.recluster() == ["mode_0 born", "mode_1 born"]
-    model._setup_learn(1)
-    model.train(5, 32)
-    names = {route_of(mode): mode.name for mode in model.modes}
-    assert names == {"down": "mode_0", "up": "mode_1"}  # the larger one first
-    return model
-
-
 def test_a_birth_leaves_the_others_as_they_are(two_routes):
     model = two_routes
     before = belongings(model)
@@ -250,7 +197,7 @@ def test_a_birth_leaves_the_others_as_they_are(two_routes):
     embedding_0 = model.policy.mode_embeddings[0].clone()
     walk(model, "right", 9)
     walk(model, "up", 3)
-    assert model.recluster() == ["mode_2 born"]
+    assert said(model) == ["mode_2 born"]
     assert [(mode.name, route_of(mode)) for mode in model.modes] == [
         ("mode_2", "right"),
         ("mode_1", "up"),
@@ -276,13 +223,13 @@ def test_a_merge_and_a_split(two_routes):
     model = two_routes
     before = belongings(model)
     model.distance_threshold = 100.0
-    assert model.recluster() == ["mode_1 merged into mode_0"]
+    assert said(model) == ["mode_1 merged into mode_0"]
     assert model.modes.names == ["mode_0"] and model.modes[0].n_trajectories == 9
     assert same(belongings(model)["mode_0"], before["mode_0"])
     walk(model, "right", 3)
     model.distance_threshold = 2.0
     # All were one mode: the largest part goes on with the name, the name of the merged one is not used again
-    assert model.recluster() == ["mode_2 split from mode_0", "mode_3 born"]
+    assert said(model) == ["mode_2 split from mode_0", "mode_3 born"]
     assert {mode.name: route_of(mode) for mode in model.modes} == {"mode_0": "down", "mode_2": "up", "mode_3": "right"}
     after = belongings(model)
     assert same(after["mode_0"], before["mode_0"])
@@ -298,26 +245,26 @@ def test_a_retirement(two_routes):
     model.recluster()
     # Nobody reaches the goal by its route any more, whatever the command
     model.modes["mode_1"].misses = model.mode_trials
-    assert model.recluster() == ["mode_1 retired"]
+    assert said(model) == ["mode_1 retired"]
     assert [(mode.name, route_of(mode)) for mode in model.modes] == [("mode_2", "right"), ("mode_0", "down")]
     assert all(trajectory.mode != NO_MODE for trajectory in model.replay_buffer.trajectories(True))
     assert model.replay_buffer.size() == (4 + 5 + 9) * 12  # what it leaves still serves exploration
     # It may come back, under a new name
     walk(model, "up", 4)
-    assert model.recluster() == ["mode_3 born"]
+    assert said(model) == ["mode_3 born"]
 
 
 def test_misses_are_counted_until_the_route_is_taken(two_routes):
     model, buffer = two_routes, two_routes.replay_buffer
     mode = model.modes["mode_1"]
     mode.misses = 7
-    for route, commanded, success in (("up", None, True), ("down", "mode_1", True), ("up", "mode_1", False)):
+    for route, commanded, success in (("up", None, True), ("down", 1, True), ("up", 1, False)):
         walk(model, route, 1, success)
         buffer.trajectories(success)[-1].commanded = commanded
-        assert model.recluster() == [] and mode.misses == 7
+        assert said(model) == [] and mode.misses == 7
     walk(model, "up", 1)
-    buffer.trajectories(True)[-1].commanded = "mode_1"
-    assert model.recluster() == [] and mode.misses == 0
+    buffer.trajectories(True)[-1].commanded = 1
+    assert said(model) == [] and mode.misses == 0
 
 
 def test_an_obedient_mode_is_not_given_up_however_rarely_it_is_clustered(two_routes):
@@ -325,12 +272,12 @@ def test_an_obedient_mode_is_not_given_up_however_rarely_it_is_clustered(two_rou
     model = two_routes
     model.mode_trials = 20
     for _ in range(3):
-        for mode, route in (("mode_1", "up"), ("mode_0", "up")):
-            walk(model, route, 25)
+        for number in (1, 0):
+            walk(model, "up", 25)
             for trajectory in model.replay_buffer.trajectories(True)[-25:]:
-                trajectory.commanded = mode
-            model.modes[mode].unjudged = 25
-        events = model.recluster()
+                trajectory.commanded = number
+            model.modes[f"mode_{number}"].unjudged = 25
+        events = said(model)
         if events:
             break
         assert model.modes["mode_1"].misses == 0 and model.modes["mode_0"].misses == 25
@@ -342,16 +289,16 @@ def test_a_dormant_mode_is_given_up_too(two_routes):
     model.replay_buffer.reset()
     model.replay_buffer.expect_modes(2)
     walk(model, "up", 4)
-    assert model.recluster() == []
+    assert said(model) == []
     model.modes["mode_0"].misses = model.mode_trials
-    assert model.recluster() == ["mode_0 retired"] and model.modes.names == ["mode_1"]
+    assert said(model) == ["mode_0 retired"] and model.modes.names == ["mode_1"]
 
 
 def test_the_last_modes_are_not_given_up(two_routes):
     """When none can be commanded, the policy is at fault."""
     for mode in two_routes.modes:
         mode.misses = 10_000
-    assert two_routes.recluster() == [] and two_routes.modes.names == ["mode_0", "mode_1"]
+    assert said(two_routes) == [] and two_routes.modes.names == ["mode_0", "mode_1"]
 
 
 def test_a_mode_without_a_cluster_goes_on(two_routes):
@@ -359,7 +306,7 @@ def test_a_mode_without_a_cluster_goes_on(two_routes):
     before = belongings(model)
     model.min_mode_size = 5  # it has four
     for _ in range(20):
-        assert model.recluster() == []
+        assert said(model) == []
     assert same(belongings(model)["mode_1"], before["mode_1"])
 
 
@@ -368,20 +315,20 @@ def test_no_mode_is_born_when_exploration_is_over(two_routes):
     model.exploration_share = 0.0
     model.num_timesteps = model.learning_starts
     walk(model, "right", 4)
-    assert model.recluster() == [] and model.modes.names == ["mode_0", "mode_1"]
+    assert said(model) == [] and model.modes.names == ["mode_0", "mode_1"]
     assert sum(trajectory.mode == NO_MODE for trajectory in model.replay_buffer.trajectories(True)) == 4
     # A part that would split off stays where it was
     model.distance_threshold = 100.0
-    assert model.recluster() == ["mode_1 merged into mode_0"]
+    assert said(model) == ["mode_1 merged into mode_0"]
     model.distance_threshold = 2.0
-    assert model.recluster() == [] and model.modes["mode_0"].n_trajectories == 4 + 5 + 4
+    assert said(model) == [] and model.modes["mode_0"].n_trajectories == 4 + 5 + 4
     model.exploration_share = 0.1
-    assert model.recluster() == ["mode_2 split from mode_0", "mode_3 split from mode_0"]
+    assert said(model) == ["mode_2 split from mode_0", "mode_3 split from mode_0"]
     # The first mode is always welcome
     model = planar_model(exploration_share=0.0)
     model.num_timesteps = model.learning_starts
     walk(model, "up", 4)
-    assert model.recluster() == ["mode_0 born"]
+    assert said(model) == ["mode_0 born"]
 
 
 def test_patience_outlasts_a_doubt(two_routes):
@@ -389,13 +336,13 @@ def test_patience_outlasts_a_doubt(two_routes):
     before = belongings(model)
     model.mode_patience, model.distance_threshold = 2, 100.0
     for _ in range(2):
-        assert model.recluster() == [] and set(model.modes.names) == {"mode_0", "mode_1"}
+        assert said(model) == [] and set(model.modes.names) == {"mode_0", "mode_1"}
         assert {mode.name: mode.n_trajectories for mode in model.modes} == {"mode_0": 5, "mode_1": 4}
     assert all(same(before[name], belongings(model)[name]) for name in before)
     model.distance_threshold = 2.0
-    assert model.recluster() == []  # all is well again, and the count starts anew
+    assert said(model) == []  # all is well again, and the count starts anew
     model.distance_threshold = 100.0
-    assert [model.recluster() for _ in range(3)] == [[], [], ["mode_1 merged into mode_0"]]
+    assert [said(model) for _ in range(3)] == [[], [], ["mode_1 merged into mode_0"]]
 
 
 def test_target_actions_follow_their_lineage(two_routes):
@@ -437,7 +384,7 @@ def test_environments_follow_names_not_numbers(two_routes):
     assert indices == {"mode_2": 0, "mode_0": 1, "mode_1": 2}
     assert model._behavior.groups.tolist() == [2, 3, EXPLORATORY_GROUP, UNCONDITIONED]
     model.modes["mode_1"].misses = model.mode_trials
-    assert model.recluster() == ["mode_1 retired"]
+    assert said(model) == ["mode_1 retired"]
     assert model._behavior.groups.tolist() == [2, UNCONDITIONED, EXPLORATORY_GROUP, UNCONDITIONED]
 
 
@@ -445,7 +392,7 @@ def test_failures_go_to_the_nearest_mode(two_routes):
     model, buffer = two_routes, two_routes.replay_buffer
     walk(model, "up", 3, success=False, part=0.7)
     walk(model, "down", 2, success=False, part=0.8)
-    assert model.recluster() == []
+    assert said(model) == []
     owners = [model.modes[trajectory.mode].name for trajectory in buffer.trajectories(success=False)]
     assert owners == ["mode_1"] * 3 + ["mode_0"] * 2
     for index, mode in enumerate(model.modes):
@@ -493,38 +440,38 @@ def test_max_modes():
     # 1 turns clustering off: whatever reaches the goal is the one mode
     model = planar_model(max_modes=1)
     walk(model, "up", 2)
-    assert model.recluster() == []  # too few
+    assert said(model) == []  # too few
     walk(model, "right", 1)
-    assert model.recluster() == ["mode_0 born"] and model.modes[0].n_trajectories == 3
+    assert said(model) == ["mode_0 born"] and model.modes[0].n_trajectories == 3
     walk(model, "down", 4)
-    assert model.recluster() == [] and model.modes.names == ["mode_0"] and model.modes[0].n_trajectories == 7
+    assert said(model) == [] and model.modes.names == ["mode_0"] and model.modes[0].n_trajectories == 7
 
 
 def test_too_few_successes_change_nothing(two_routes):
     model = two_routes
     model.min_mode_size = 50
     before = belongings(model)
-    assert model.recluster() == [] and model.modes.names == ["mode_0", "mode_1"]
+    assert said(model) == [] and model.modes.names == ["mode_0", "mode_1"]
     assert all(same(before[name], belongings(model)[name]) for name in before)
     empty = planar_model()
-    assert empty.recluster() == [] and len(empty.modes) == 0
+    assert said(empty) == [] and len(empty.modes) == 0
     walk(empty, "up", 2, success=False)
-    assert empty.recluster() == [] and len(empty.modes) == 0
+    assert said(empty) == [] and len(empty.modes) == 0
 
 
 def test_a_foreign_trajectory_is_a_failure_of_the_mode_it_was_told_to_follow(two_routes):
     model, buffer = two_routes, two_routes.replay_buffer
     walk(model, "up", 2)
     strayed, obedient = buffer.trajectories(True)[-2:]
-    strayed.commanded, obedient.commanded = "mode_0", "mode_1"
-    assert model.recluster() == []
+    strayed.commanded, obedient.commanded = 0, 1
+    assert said(model) == []
     indices = {mode.name: index for index, mode in enumerate(model.modes)}
     assert strayed.foreign and strayed.mode == indices["mode_0"] and strayed in buffer.trajectories(success=False)
     assert not obedient.foreign and obedient.mode == indices["mode_1"] and obedient in buffer.trajectories(success=True)
     # It begins at the common start and then leads away from the route down
     off_route = buffer.off_route[strayed.rows]
     assert not off_route[0] and off_route[3:].all() and not buffer.off_route[obedient.rows].any()
-    assert model.recluster() == [] and strayed.mode == {mode.name: i for i, mode in enumerate(model.modes)}["mode_0"]
+    assert said(model) == [] and strayed.mode == {mode.name: i for i, mode in enumerate(model.modes)}["mode_0"]
 
 
 def test_a_route_that_was_found_against_orders_is_a_mode(two_routes):
@@ -533,17 +480,17 @@ def test_a_route_that_was_found_against_orders_is_a_mode(two_routes):
     walk(model, "right", 4)
     discoverers = buffer.trajectories(True)[-4:]
     for trajectory in discoverers:
-        trajectory.commanded = "mode_0"
-    assert model.recluster() == ["mode_2 born"]
+        trajectory.commanded = 0
+    assert said(model) == ["mode_2 born"]
     assert model.modes["mode_2"].n_trajectories == 4 and not any(trajectory.foreign for trajectory in discoverers)
     # From now on it is known, and who takes it against orders strays
     walk(model, "right", 1)
     (strayed,) = buffer.trajectories(True)[-1:]
-    strayed.commanded = "mode_0"
+    strayed.commanded = 0
     walk(model, "right", 1)
-    buffer.trajectories(True)[-1].commanded = "of a mode that has ended"
+    buffer.trajectories(True)[-1].commanded = 77  # a mode that has ended
     fill(buffer, [np.linspace((0, 0), (-6, 6), 7, dtype=np.float32)])  # an outlier
-    assert model.recluster() == [] and strayed.foreign
+    assert said(model) == [] and strayed.foreign
     assert [trajectory for trajectory in buffer.trajectories(False) if trajectory.foreign] == [strayed]
 
 
@@ -554,12 +501,12 @@ def test_what_was_foreign_to_a_mode_that_has_ended(two_routes):
     walk(model, "up", 2, success=False, part=0.7)
     strayed, failed = buffer.trajectories(True)[-3:], buffer.trajectories(False)[-2:]
     for trajectory in (*strayed, *failed):
-        trajectory.commanded = "mode_0"
-    assert model.recluster() == []
+        trajectory.commanded = 0
+    assert said(model) == []
     down = model.modes.index("mode_0")
     assert all(t.mode == down for t in (*strayed, *failed)) and all(t.foreign for t in strayed)
     model.modes["mode_0"].misses = model.mode_trials
-    assert model.recluster() == ["mode_0 retired"] and model.modes.names == ["mode_1"]
+    assert said(model) == ["mode_0 retired"] and model.modes.names == ["mode_1"]
     assert not any(t.foreign or buffer.off_route[t.rows].any() for t in strayed)
     assert all(t in buffer.trajectories(True) and t.mode == 0 for t in strayed) and model.modes[0].n_trajectories == 7
     assert all(t.mode == 0 for t in failed)
@@ -572,7 +519,7 @@ def test_a_mode_is_shown_the_newest_failures(two_routes):
     for _ in range(3):
         walk(model, "up", 1, success=False, part=0.7)
         walk(model, "down", 1)
-        buffer.trajectories(True)[-1].commanded = "mode_1"
+        buffer.trajectories(True)[-1].commanded = 1
     newest = buffer.trajectories(False)[-2:], buffer.trajectories(True)[-2:]
     model.recluster()
     up = model.modes.index("mode_1")
@@ -585,14 +532,14 @@ def test_what_a_dormant_mode_finds_is_its_own(two_routes):
     model.replay_buffer.reset()
     model.replay_buffer.expect_modes(2)
     walk(model, "up", 4)
-    assert model.recluster() == [] and {mode.name: route_of(mode) for mode in model.modes} == {
+    assert said(model) == [] and {mode.name: route_of(mode) for mode in model.modes} == {
         "mode_0": "down",
         "mode_1": "up",
     }
     walk(model, "up", 6)
-    assert model.recluster() == [] and model.modes["mode_1"].n_trajectories == 10
+    assert said(model) == [] and model.modes["mode_1"].n_trajectories == 10
     walk(model, "down", 3)
-    assert model.recluster() == []
+    assert said(model) == []
     assert {mode.name: mode.n_trajectories for mode in model.modes} == {"mode_0": 3, "mode_1": 10}
     assert {mode.name: route_of(mode) for mode in model.modes} == {"mode_0": "down", "mode_1": "up"}
 
@@ -664,7 +611,8 @@ def test_success_rates_are_those_of_commanded_episodes(explore_then_exploit):
             if local_variables["dones"][env]:
                 if len(set(followed[env])) == 1 and followed[env][0] in names.values():
                     success = bool(local_variables["infos"][env]["is_success"])
-                    outcomes.setdefault(followed[env][0], []).append(success)
+                    outcome = Outcome(success, float(success), len(followed[env]))
+                    outcomes.setdefault(followed[env][0], []).append(outcome)
                 followed[env].clear()
         return True
 

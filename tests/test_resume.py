@@ -237,17 +237,17 @@ def test_the_settings_of_the_model_stay(trained, tmp_path):
         model.learn(100, reset_num_timesteps=False)
 
 
-def test_trajectories_follow_the_names_of_their_modes(saved):
+def test_trajectories_follow_their_modes(saved):
     """The buffer was saved later than the model: by then the modes had other numbers, and one more was known."""
     model, folder = saved
     route = {mode.name: np.sign(mode.representative[-1, 0]) for mode in model.modes}
     later = DDiffPG.load(folder / "model", env=two_ends())
     later.load_replay_buffer(folder / "buffer")
     improved = later.replay_buffer.target_actions.copy()
-    later._modes = [later._modes[1], Mode("mode_9", born_at=7), later._modes[0]]
-    later.replay_buffer.renumber_modes([2, 0], [mode.name for mode in later._modes])
+    later._modes = [later._modes[1], Mode(9, "mode_9", born_at=7), later._modes[0]]
+    later.replay_buffer.follow_modes([2, 0], [mode.number for mode in later._modes])
     strayed = later.replay_buffer.trajectories(False)[-1]
-    strayed.commanded = "mode_9"
+    strayed.commanded = 9
     later.save_replay_buffer(folder / "later")
     loaded = DDiffPG.load(folder / "model", env=two_ends())
     loaded.load_replay_buffer(folder / "later")
@@ -258,7 +258,7 @@ def test_trajectories_follow_the_names_of_their_modes(saved):
             assert np.sign(buffer.full_path(trajectory)[-1, 0]) == route[loaded.modes[trajectory.mode].name]
     np.testing.assert_array_equal(buffer.target_actions, improved)
     # The next mode is not taken for the one whose name only the file knows
-    assert "mode_9" not in {t.commanded for success in (True, False) for t in buffer.trajectories(success)}
+    assert 9 not in {t.commanded for success in (True, False) for t in buffer.trajectories(success)}
     assert loaded._next_mode_number == 10
 
 

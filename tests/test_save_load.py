@@ -159,7 +159,7 @@ def test_zip_size_follows_the_number_of_modes(tmp_path):
     sizes = []
     for n_modes in (0, 8):
         model = small_model(TwoEnds())
-        model._modes = [Mode(name=f"mode_{i}", born_at=i) for i in range(n_modes)]
+        model._modes = [Mode(i, f"mode_{i}", born_at=i) for i in range(n_modes)]
         model.policy.resize(n_modes)
         model.save(tmp_path / "model")
         loaded = DDiffPG.load(tmp_path / "model")

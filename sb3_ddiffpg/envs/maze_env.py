@@ -57,6 +57,7 @@ class MazeEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         self.maze = self.simulation.maze
         #: Indices of the position in the observation.
         self.mode_features = np.array([0, 1])
+        self.listed_modes = self.maze.listed_routes
         self.observation_space = self.simulation.observation_space()
         self.action_space = self.simulation.action_space()
         self.render_mode = render_mode
@@ -127,6 +128,7 @@ class MazeVecEnv(VecEnv):
         self.simulation = self.simulation_class(n_envs, maze_map=maze_map, **kwargs)
         self.maze = self.simulation.maze
         self.mode_features = np.array([0, 1])
+        self.listed_modes = self.maze.listed_routes
         self.max_episode_steps = max_episode_steps
         self.spec: EnvSpec | None = None
         # VecEnv's constructor asks get_attr for the render mode

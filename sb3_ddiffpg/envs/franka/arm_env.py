@@ -24,13 +24,16 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
 
     :param render_mode: None or ``"rgb_array"``
     :param obs_joints: whether the seven joint angles are observed too
+    :param start_noise: largest deviation of each joint's angle at the start, in rad; the task's own when None
     """
 
     metadata = _METADATA
 
     base_x: ClassVar[float]
     start_angles: ClassVar[tuple[float, ...]]
-    start_noise: ClassVar[float] = 0.0
+    default_start_noise: ClassVar[float] = 0.0
+    #: The ways of doing it
+    listed_modes: ClassVar[tuple[str, ...]]
     force_scale: ClassVar[float] = 1.0
     tool: ClassVar[str] = ""
     #: What stands in the middle of a picture
@@ -38,11 +41,14 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
     #: Number of values that the task adds to the observation
     n_extra: ClassVar[int] = 0
 
-    def __init__(self, render_mode: str | None = None, obs_joints: bool = False) -> None:
+    def __init__(self, render_mode: str | None = None, obs_joints: bool = False, start_noise: float | None = None) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode: {render_mode!r} given; accepted are None and 'rgb_array'")
         self.render_mode = render_mode
         self.obs_joints = obs_joints
+        self.start_noise = self.default_start_noise if start_noise is None else start_noise
+        if not 0 <= self.start_noise <= np.pi:
+            raise ValueError(f"start_noise: {start_noise} given; accepted are 0 to pi rad, and None")
         self.mode_features = np.arange(3)
         size = 6 + self.n_extra + 7 * obs_joints
         self.observation_space = spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)

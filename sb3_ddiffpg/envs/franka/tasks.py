@@ -6,6 +6,8 @@ from sb3_ddiffpg.envs.franka.arm import FloatArray
 from sb3_ddiffpg.envs.franka.arm_env import FrankaEnv
 from sb3_ddiffpg.envs.franka.bodies import GOAL, STEEL, WOOD, joint, link
 
+QUARTERS = ("left-up", "left-down", "right-up", "right-down")
+
 
 class FrankaReach(FrankaEnv):
     """
@@ -15,6 +17,7 @@ class FrankaReach(FrankaEnv):
     ``"right-up"``, ``"right-down"`` (left: positive y).
     """
 
+    listed_modes = QUARTERS
     base_x = -0.6
     start_angles = (0.0, -1.5, 0.0, -3.0, 0.0, 2.26, 0.79)
     looks_at = (-0.3, 0.0, 0.5)
@@ -52,9 +55,10 @@ class FrankaPegInHole(FrankaEnv):
     Done is when the peg's tip is within the hole's half-width of its axis, and below the block's top.
     """
 
+    listed_modes = ("left", "right")
     base_x = -0.6
     start_angles = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79)
-    start_noise = 0.1
+    default_start_noise = 0.1
     looks_at = (-0.1, 0.0, 0.2)
     HOLES = {"left": (0.05, 0.15), "right": (0.05, -0.15)}  # noqa: RUF012 - never changed
     HALF_WIDTH, TOP, DEPTH = 0.0203, 0.03, 0.025
@@ -97,9 +101,10 @@ class FrankaDrawerClose(FrankaEnv):
     (left: positive y). The four openings (m) are observed.
     """
 
+    listed_modes = QUARTERS
     base_x = -1.2
     start_angles = (0.0, -1.5, 0.0, -3.0, 0.0, 2.26, 0.79)
-    start_noise = 0.1
+    default_start_noise = 0.1
     n_extra = 4
     looks_at = (-0.6, 0.0, 0.5)
     DRAWERS = {  # noqa: RUF012 - never changed
@@ -139,6 +144,7 @@ class FrankaCabinetOpen(FrankaEnv):
     door's angle (rad) is observed.
     """
 
+    listed_modes = ("up", "down")
     base_x = -0.9
     start_angles = (-0.2, -0.5, 0.0, -2.6, 0.0, 2.2, 0.79)
     force_scale = 100.0

@@ -1,0 +1,111 @@
+"""What became of the modes in the course of a run."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+from sb3_ddiffpg.clustering import Inheritance
+from sb3_ddiffpg.modes import Mode, default_name
+
+#: What can happen to a mode; those of the second row by hand
+EVENT_KINDS = (
+    *("born", "split from", "merged into", "retired"),
+    *("renamed to", "frozen", "released", "deleted"),
+)
+
+
+@dataclass(frozen=True)
+class ModeEvent:
+    """
+    Something that happened to a mode. ``str(event)`` is a sentence.
+
+    :param step: Environment steps at that time
+    :param kind: One of ``EVENT_KINDS``
+    :param number: The mode's number, which nothing changes
+    :param name: Its name at that time
+    :param other: Name of the mode from which it split or into which it was merged, or its new name
+    """
+
+    step: int
+    kind: str
+    number: int
+    name: str
+    other: str | None = None
+
+    def __str__(self) -> str:
+        return " ".join(part for part in (self.name, self.kind, self.other) if part is not None)
+
+
+@dataclass(frozen=True)
+class ModeState:
+    """
+    A mode at one re-clustering.
+
+    :param step: Environment steps at that time
+    :param number: The mode's number
+    :param n_trajectories: Goal-reached trajectories that train it
+    :param success_rate: Share of successes among its latest commanded training episodes, NaN if there are none
+    """
+
+    step: int
+    number: int
+    n_trajectories: int
+    success_rate: float
+
+
+@dataclass
+class ModeHistory:
+    """
+    All events of a run, and every mode's state at each re-clustering. Iterate over the events, or print them.
+
+    :param events: In order of time
+    :param states: In order of time
+    """
+
+    events: list[ModeEvent] = field(default_factory=list)
+    states: list[ModeState] = field(default_factory=list)
+
+    def note(self, step: int, modes: Sequence[Mode]) -> None:
+        """
+        :param step: Environment steps so far
+        :param modes: The modes at a re-clustering
+        """
+        self.states += [ModeState(step, mode.number, mode.n_trajectories, mode.success_rate) for mode in modes]
+
+    def __iter__(self) -> Iterator[ModeEvent]:
+        return iter(self.events)
+
+    def __len__(self) -> int:
+        return len(self.events)
+
+    def __str__(self) -> str:
+        return "\n".join(f"{event.step:>10}  {event}" for event in self.events) or "nothing has happened to a mode yet"
+
+
+def succeed(
+    old: Sequence[Mode], inheritance: Inheritance, step: int, first_free_number: int
+) -> tuple[list[Mode], list[ModeEvent]]:
+    """
+    The modes after a re-clustering: heirs keep number, name and record, newcomers get a number never used before.
+
+    :param old: Modes before
+    :param inheritance: Which new cluster follows which old mode
+    :param step: Environment steps so far
+    :param first_free_number: Number for the next new mode
+    :return: The new modes, and what happened
+    """
+    modes: list[Mode] = []
+    events: list[ModeEvent] = []
+    number = first_free_number
+    for parent, kept in zip(inheritance.parents, inheritance.kept, strict=True):
+        if kept and parent is not None:
+            modes.append(old[parent])
+            continue
+        name = default_name(number)
+        modes.append(Mode(number, name, born_at=step))
+        came = ("born", None) if parent is None else ("split from", old[parent].name)
+        events.append(ModeEvent(step, came[0], number, name, came[1]))
+        number += 1
+    ended = {loser: ("merged into", modes[heir].name) for loser, heir in sorted(inheritance.merged.items())}
+    for gone, (kind, other) in {**ended, **{gone: ("retired", None) for gone in sorted(inheritance.retired)}}.items():
+        events.append(ModeEvent(step, kind, old[gone].number, old[gone].name, other))
+    return modes, events

@@ -1,0 +1,273 @@
+"""What a user does with modes: rename, freeze, delete, filter, choose by value, and read what became of them."""
+
+import numpy as np
+import pytest
+import torch as th
+from environments import some_observations
+from planar import belongings, planar_model, route_of, said, same, walk
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.modes import Outcome
+
+# ---------------------------------------------------------------------- names
+
+
+def test_a_name_is_kept_for_life(two_routes, tmp_path):
+    model = two_routes
+    names = {route_of(mode): mode.name for mode in model.modes}
+    assert names == {"down": "mode_0", "up": "mode_1"}
+    model.rename_mode(names["up"], "over the hill")
+    model.rename_mode(names["down"], "tal-2")
+    walk(model, "up", 3)
+    walk(model, "right", 6)
+    assert said(model) == ["mode_2 born"]
+    assert {mode.name: route_of(mode) for mode in model.modes} == {"over the hill": "up", "tal-2": "down", "mode_2": "right"}
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    model.rename_mode("over the hill", "mode_1")  # back to the name that it was born with
+    model.rename_mode("tal-2", "over the hill")
+    loaded = DDiffPG.load(tmp_path / "model", env=model.env)
+    assert set(loaded.modes.names) == {"over the hill", "tal-2", "mode_2"}
+    loaded.set_logger(model.logger)
+    loaded.rename_mode("over the hill", "hill")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    walk(loaded, "down", 3)
+    assert said(loaded) == [] and route_of(loaded.modes["hill"]) == "up"
+    assert all(mode.n_trajectories >= 5 for mode in loaded.modes)
+    loaded.predict(np.zeros(2, dtype=np.float32), mode="hill")
+    assert [str(event) for event in loaded.mode_history][-2:] == ["mode_2 born", "over the hill renamed to hill"]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("", "is no name of a mode: accepted are 1 to 40 letters"),
+        ("7", "not digits alone"),
+        ("a/b", "is no name"),
+        (" a", "is no name"),
+        ("x" * 41, "is no name"),
+        (3, "is no name"),
+        ("mode_1", r"is another mode's; the modes are \['mode_0', 'mode_1'\]"),
+        ("mode_5", "reserved for the mode that is born with it"),
+    ],
+)
+def test_names_that_are_refused(two_routes, name, message):
+    with pytest.raises(ValueError, match=message):
+        two_routes.rename_mode("mode_0", name)
+    with pytest.raises(ValueError, match="'hill' is unknown"):
+        two_routes.rename_mode("hill", "valley")
+    assert two_routes.modes.names == ["mode_0", "mode_1"] and len(two_routes.mode_history) == 2
+
+
+# ---------------------------------------------------------------------- freezing
+
+
+def merge_everything(model):
+    model.distance_threshold = 100.0
+
+
+def test_a_frozen_mode_is_not_merged(two_routes):
+    model = two_routes
+    model.freeze_mode("mode_1")
+    before = belongings(model)["mode_1"]
+    merge_everything(model)
+    assert [said(model) for _ in range(4)] == [[]] * 4  # mode_patience is 0
+    assert same(belongings(model)["mode_1"], before) and model.modes["mode_1"].frozen
+    model.freeze_mode("mode_1", False)
+    assert said(model) == ["mode_0 merged into mode_1"] or said(model) == []
+    assert len(model.modes) == 1
+    assert [event.kind for event in model.mode_history] == ["born", "born", "frozen", "released", "merged into"]
+
+
+def test_a_frozen_mode_is_not_crowded_out(two_routes):
+    """By one more way than there may be modes: without the ice the smallest would go, and the frozen one is that."""
+    model = two_routes
+    model.max_modes = 2
+    model.freeze_mode("mode_1")  # of 4, the other has 5
+    walk(model, "right", 9)
+    model.recluster()
+    assert len(model.modes) == 2 and route_of(model.modes["mode_1"]) == "up"
+
+
+def test_a_frozen_mode_is_not_given_up(two_routes):
+    model = two_routes
+    model.mode_trials = 5
+    model.freeze_mode("mode_0")
+    for mode in model.modes:
+        mode.misses = 50
+    assert said(model) == ["mode_1 retired"] and model.modes.names == ["mode_0"]
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_trajectories_of_a_frozen_mode_leave_the_buffer_last(frozen):
+    model = planar_model(buffer_size=600)
+    walk(model, "up", 30)  # the largest group by far, from which the oldest would go
+    walk(model, "down", 5)
+    model.recluster()
+    mode = next(mode for mode in model.modes if route_of(mode) == "up")
+    model.freeze_mode(mode, frozen)
+    buffer = model.replay_buffer
+    walk(model, "right", 20)
+    assert buffer.full
+    stored = {trajectory.serial for trajectory in buffer.trajectories(True)}
+    assert (set(range(30)) <= stored) == frozen
+
+
+def test_a_run_goes_on_where_only_frozen_modes_fill_the_buffer():
+    model = planar_model(buffer_size=200)
+    walk(model, "up", 5)
+    model.recluster()
+    model.freeze_mode(0)
+    for _ in range(10):
+        walk(model, "up", 3)
+        model.recluster()
+    assert model.replay_buffer.full and model.modes[0].n_trajectories > 5
+
+
+def test_frozen_survives_saving(two_routes, tmp_path):
+    two_routes.freeze_mode("mode_1")
+    two_routes.save(tmp_path / "model")
+    two_routes.save_replay_buffer(tmp_path / "buffer")
+    loaded = DDiffPG.load(tmp_path / "model", env=two_routes.env)
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    assert [mode.frozen for mode in loaded.modes] == [False, True] and loaded.replay_buffer.frozen_modes == {1}
+
+
+# ---------------------------------------------------------------------- deleting
+
+
+def test_a_deleted_mode_is_gone_and_the_others_are_as_before(two_routes):
+    model = two_routes
+    walk(model, "right", 6)
+    model.recluster()
+    before, routes = belongings(model), {mode.name: route_of(mode) for mode in model.modes}
+    model._behavior.begin_all(3, 3, 0.0, 0.0)
+    names = ["mode_0", "mode_1", "mode_2"]
+    model._behavior.groups = np.array([model.modes.index(name) + 1 for name in names])  # each drives an environment
+    model.delete_mode("mode_1")
+    assert set(model.modes.names) == {"mode_0", "mode_2"}
+    assert model._behavior.groups.tolist() == [model.modes.index("mode_0") + 1, -1, model.modes.index("mode_2") + 1]
+    after = belongings(model)
+    assert all(same(after[name], before[name]) for name in after)
+    assert {mode.name: route_of(mode) for mode in model.modes} == {name: routes[name] for name in after}
+    assert str(model.mode_history.events[-1]) == "mode_1 deleted"
+    model.train(2, 32)
+    assert said(model) == []  # its trajectories do not bring it back
+    walk(model, routes["mode_1"], 6)
+    assert said(model) == ["mode_3 born"]  # new ones do, under a name of their own
+    for mode in list(model.modes):
+        model.delete_mode(mode)
+    assert len(model.modes) == 0
+    model.train(2, 32)
+    with pytest.raises(ValueError, match="'mode_0' is unknown; there is no mode yet"):
+        model.delete_mode("mode_0")
+
+
+# ---------------------------------------------------------------------- filters
+
+
+def test_a_mode_that_returns_too_little_is_left_out(two_routes):
+    model = two_routes
+    for trajectory in model.replay_buffer.trajectories(True):
+        trajectory.episode_return = 1.0 if trajectory.mode == 0 else 0.4
+    model.min_return_ratio = 0.39
+    assert said(model) == []
+    model.min_return_ratio = 0.41
+    assert said(model) == ["mode_1 retired"] and model.modes.names == ["mode_0"]
+    # where the best return is no gain, a share of it says nothing
+    other = planar_model(min_return_ratio=1.0)
+    walk(other, "up", 4)
+    walk(other, "down", 5)
+    for trajectory in other.replay_buffer.trajectories(True):
+        trajectory.episode_return = -float(trajectory.serial)
+    assert len(said(other)) == 2
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, "a", None])
+def test_the_ratio_is_a_share(value):
+    with pytest.raises(ValueError, match=r"min_return_ratio must lie in \[0, 1\]"):
+        planar_model(min_return_ratio=value)
+
+
+# ---------------------------------------------------------------------- history
+
+
+def test_history(two_routes):
+    model = two_routes
+    assert [(event.step, event.kind, event.number) for event in model.mode_history] == [(0, "born", 0), (0, "born", 1)]
+    model.num_timesteps = 500
+    model._modes[0].outcomes.extend([Outcome(True, 1.0, 5), Outcome(False, 0.0, 9)])
+    model.recluster()
+    states = model.mode_history.states
+    assert [(state.step, state.number) for state in states] == [(0, 0), (0, 1), (500, 0), (500, 1)]
+    assert states[2].success_rate == 0.5 and states[2].n_trajectories == model.modes[0].n_trajectories
+    assert str(model.mode_history).splitlines()[0].split() == ["0", "mode_0", "born"]
+    assert "nothing has happened" in str(planar_model().mode_history)
+
+
+# ---------------------------------------------------------------------- choosing
+
+
+def slow_value(model, observation, mode, n_actions):
+    """One observation, one mode and one action at a time."""
+    policy, values = model.policy, []
+    for _ in range(n_actions):
+        action, _ = policy.predict(observation, mode=mode)
+        tensor = th.as_tensor(observation, device=model.device)[None]
+        scaled = th.as_tensor(policy.scale_action(action), device=model.device)[None]
+        group = [tensor] * policy.critics.n_groups
+        logits = policy.critics(policy.critic_features(th.cat(group)), scaled.expand(policy.critics.n_groups, 1, -1))
+        values.append(policy.critics.values(logits)[mode + 1].min().item())
+    return np.mean(values)
+
+
+def test_values_are_those_of_each_modes_own_critics(trained):
+    observations = some_observations(4)
+    th.manual_seed(0)
+    values = trained.mode_values(observations, n_actions=400)
+    assert values.shape == (4, len(trained.modes)) and trained.mode_values(observations[0]).shape == (len(trained.modes),)
+    expected = [[slow_value(trained, obs, mode, 400) for mode in range(len(trained.modes))] for obs in observations]
+    np.testing.assert_allclose(values, expected, atol=0.1 * np.ptp(expected) + 1e-3)
+    best = trained.best_mode(observations, n_actions=400)
+    clear = np.abs(np.diff(np.sort(expected, axis=1)[:, -2:])).ravel() > 0.2 * np.ptp(expected)
+    assert clear.any()
+    for name, row, is_clear in zip(best, expected, clear, strict=True):
+        assert name == trained.modes[int(np.argmax(row))].name or not is_clear
+    assert trained.best_mode(observations[0]) in trained.modes.names
+
+
+def test_without_modes_nothing_is_chosen(trained):
+    model = planar_model()
+    for method in (model.best_mode, model.mode_values):
+        with pytest.raises(ValueError, match="no mode yet"):
+            method(np.zeros(2, dtype=np.float32))
+    with pytest.raises(ValueError, match="n_actions must be at least 1, got 0"):
+        trained.mode_values(some_observations(1), n_actions=0)
+
+
+def test_exploration_is_never_what_a_trained_model_does(trained, monkeypatch):
+    """Of all ways to ask for an action."""
+    used = []
+    actor = trained.policy.actor
+    forward = type(actor).forward
+
+    def spy(self, obs, deterministic=False, embeddings=None):
+        used.append(embeddings)
+        return forward(self, obs, deterministic, embeddings)
+
+    monkeypatch.setattr(type(actor), "forward", spy)
+    observations = some_observations(8)
+    trained.predict(observations)
+    trained.predict(observations, mode=0)
+    trained.predict(observations, episode_start=np.ones(8, dtype=bool))
+    exploring = trained.policy.mode_embeddings[0]
+    assert len(used) == 3 and used[0] is None
+    assert not any((embeddings == exploring).all(dim=-1).any() for embeddings in used[1:])
+
+
+def test_a_model_in_use_is_not_changed_by_asking(two_routes):
+    before = belongings(two_routes)
+    two_routes.best_mode(np.zeros((3, 2), dtype=np.float32))
+    assert all(same(after, before[name]) for name, after in belongings(two_routes).items())
+    assert isinstance(two_routes.env, DummyVecEnv)
