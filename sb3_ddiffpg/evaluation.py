@@ -4,7 +4,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from sb3_ddiffpg.clustering import cluster
 from sb3_ddiffpg.dtw import dtw_distances, erase_loops, resample_path
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.episodes import EpisodeResult, run_episodes
+from sb3_ddiffpg.trajectories import NO_MODE
 
 #: Share of episodes from which on a way counts as one that the model robustly takes
 ROBUST_SHARE = 0.05
@@ -87,6 +88,7 @@ class ModeEvaluation:
     :param uncommanded: Episodes in which the model chose for itself
     :param commanded: Those under each command
     :param ways: The ways that were taken
+    :param episodes: All episodes by command, ``"(none)"`` without; not saved
     """
 
     env_id: str
@@ -96,6 +98,7 @@ class ModeEvaluation:
     uncommanded: CommandResult
     commanded: tuple[CommandResult, ...]
     ways: tuple[WayResult, ...]
+    episodes: dict[str, list[EpisodeResult]] = field(default_factory=dict, compare=False, repr=False)
 
     def expected_modes(self, n_draws: int = 20) -> float:
         """
@@ -167,7 +170,7 @@ class ModeEvaluation:
 
     def __str__(self) -> str:
         rows = [*self.commanded, self.uncommanded]
-        names = ["(none)" if row.mode is None else row.mode for row in rows]
+        names = [_command_name(row.mode) for row in rows]
         width = max(9, *map(len, names))
         lines = [f"{'commanded':<{width}}  success      95 % interval   length   return  ways taken"]
         for name, row in zip(names, rows, strict=True):
@@ -207,9 +210,13 @@ class ModeEvaluation:
             "control_accuracy": _number(self.control_accuracy),
             "commandable": self.commandable,
             "matching": self.matching,
-            "success_intervals": {str(each.mode): each.success_interval for each in [*self.commanded, self.uncommanded]},
+            "success_intervals": {
+                _command_name(each.mode): each.success_interval for each in [*self.commanded, self.uncommanded]
+            },
         }
-        return {"format": _FORMAT, **_without_nan(asdict(self)), "summary": summary}
+        counted = asdict(replace(self, episodes={}))
+        del counted["episodes"]
+        return {"format": _FORMAT, **_without_nan(counted), "summary": summary}
 
     @staticmethod
     def load(path: str | Path) -> "ModeEvaluation":
@@ -234,6 +241,10 @@ class ModeEvaluation:
             commanded=tuple(command(row) for row in data["commanded"]),
             ways=tuple(WayResult(**row) for row in data["ways"]),
         )
+
+
+def _command_name(mode: str | None) -> str:
+    return "(none)" if mode is None else mode
 
 
 def _number(value: float) -> float | None:
@@ -318,7 +329,24 @@ def evaluate_modes(
         uncommanded=results[-1],
         commanded=tuple(results[:-1]),
         ways=_ways(runs, labels),
+        episodes={_command_name(command): run for command, run in zip(commands, runs, strict=True)},
     )
+
+
+def clustering_agreement(model: Any) -> float:
+    """
+    How well the modes of the stored trajectories agree with the environment's own labels. The clustering never saw those.
+
+    :param model: A DDiffPG with its replay buffer
+    :return: Adjusted Rand index over the goal-reached trajectories that have a mode and a label (1: the same partition, 0: as
+        by chance); NaN if there are none
+    """
+    from sklearn.metrics import adjusted_rand_score  # of the extra "plots"
+
+    known = [t for t in model.replay_buffer.trajectories(True) if t.mode != NO_MODE and t.label is not None]
+    if not known:
+        return float("nan")
+    return float(adjusted_rand_score([t.label for t in known], [t.mode for t in known]))
 
 
 def _labels(model: Any, runs: list[list[EpisodeResult]]) -> tuple[list[list[str | None]], str]:

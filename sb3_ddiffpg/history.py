@@ -1,5 +1,6 @@
 """What became of the modes in the course of a run."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -70,6 +71,25 @@ class ModeHistory:
         :param modes: The modes at a re-clustering
         """
         self.states += [ModeState(step, mode.number, mode.n_trajectories, mode.success_rate) for mode in modes]
+
+    def share_kept(self, min_trajectories: int = 20, from_step: int = 0) -> float:
+        """
+        How steady the modes are.
+
+        :param min_trajectories: A mode that trains on so many is established
+        :param from_step: Earlier re-clusterings do not count
+        :return: Share of the re-clusterings that kept every mode established before them; NaN if there was none to keep
+        """
+        by_step: dict[int, dict[int, int]] = {}
+        for state in self.states:
+            by_step.setdefault(state.step, {})[state.number] = state.n_trajectories
+        steps = [step for step in by_step if step >= from_step]
+        kept = []
+        for before, after in itertools.pairwise(steps):
+            established = {number for number, n in by_step[before].items() if n >= min_trajectories}
+            if established:
+                kept.append(established <= set(by_step[after]))
+        return sum(kept) / len(kept) if kept else float("nan")
 
     def __iter__(self) -> Iterator[ModeEvent]:
         return iter(self.events)

@@ -262,6 +262,7 @@ class TrajectoryReplayBuffer(ReplayBuffer):
             success=self._success_rule(info, float(self._running_return[env])),
             episode_return=float(self._running_return[env]),
             serial=self._n_finished,
+            label=None if info.get("mode") is None else str(info["mode"]),
         )
         self._n_finished += 1
         self._running_length[env] = 0
