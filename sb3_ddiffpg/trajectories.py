@@ -26,8 +26,8 @@ class Trajectory:
     :param commanded: Number of the mode that it was told to follow, None if none
     :param foreign: It followed a command to its mode, but reached the goal by another mode's route: its mode is shown it as
         a failure, so that it learns to keep to its own
-    :param label: Ground truth of the way it took, ``info["mode"]`` of its last step, None if there is none; for evaluation, seen
-        by no part of the algorithm
+    :param label: Ground truth of the way it took, ``info["mode"]`` of its last step, None if there is none; for evaluation,
+        no part of the algorithm sees it
     :param path: Mode features resampled to equal steps, shape [n_path_points, dim]; made when first needed
     """
 

@@ -5,7 +5,7 @@ scripts (https://rl-baselines3-zoo.readthedocs.io) and DDiffPG where nothing els
 
 import argparse
 import difflib
-import importlib
+import importlib.util
 import inspect
 import os
 import runpy
@@ -250,8 +250,18 @@ def train(arguments: Sequence[str]) -> None:
     if hyperparams:
         rest += ["--hyperparams", *hyperparams]
     path = config_file(known.conf_file or known.algo) or known.conf_file
+    if path is not None and not Path(path).is_file() and not _is_module(str(path)):
+        ours = sorted(each.stem for each in config_file(ALGO).parent.glob("*.yml"))  # type: ignore[union-attr]
+        raise SystemExit(f"--conf-file: {known.conf_file!r} given; accepted are a YAML or Python file, a module, and {ours}")
     with _command_line([*([] if path is None else ["--conf-file", str(path)]), *rest]):
         rl_zoo3.train.train()
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:  # of its parent
+        return False
 
 
 def enjoy(arguments: Sequence[str]) -> None:

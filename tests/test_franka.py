@@ -79,7 +79,8 @@ def push(mode):
 def pull(mode):
     z = 0.7 if mode == "up" else 0.38
     inwards = Rotation.from_euler("z", 30, degrees=True) * FORWARDS * Rotation.from_euler("z", 90, degrees=True)
-    return follow([(-0.5, -0.2, z), (-0.3, -0.18, z), (-0.3, 0.05, z), (-0.4, 0.1, z), (-0.65, 0.1, z)], inwards, near=0.08)
+    corners = [(-0.5, -0.2, z), (-0.3, -0.18, z), (-0.3, 0.05, z), (-0.4, 0.1, z), (-0.65, 0.1, z)]
+    return follow(corners, inwards, near=0.08 if mode == "up" else 0.05)
 
 
 SOLUTIONS = [
@@ -156,14 +157,20 @@ def test_seeds_reproduce_whatever_was_done_before(env_id):
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_a_copy_goes_on_from_where_it_was_made(env_id):
-    env, rng = gym.make(env_id, obs_joints=True), np.random.default_rng(1)
-    env.reset(seed=1)
-    towards = rng.normal(size=7)
-    for _ in range(30):  # until things touch
-        env.step(np.clip(towards + 0.3 * rng.normal(size=7), -1, 1))
-    copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    """Also where things press on each other."""
+    env = gym.make(env_id, obs_joints=True)
+    unused = copy.deepcopy(env)
+    start, _ = env.reset(seed=1)
+    np.testing.assert_array_equal(unused.reset(seed=1)[0], start)
+    unused.close()
+    world = env.unwrapped
+    into = {"Reach": (-0.22, 0.1, 0.67), "PegIn": (0.1, 0.15, -0.1), "Drawe": (-0.3, 0.2, 0.7), "Cabin": (-0.1, 0.1, 0.5)}
     for _ in range(30):
-        action = np.clip(towards + 0.3 * rng.normal(size=7), -1, 1)
+        env.step(towards(world, into[env_id[6:11]]))
+    assert world.arm.penetration() > 0 or env_id == "FrankaDrawerClose-v0"  # which gives way
+    copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    for _ in range(20):
+        action = towards(world, into[env_id[6:11]])
         expected = env.step(action)
         for other in copies:
             np.testing.assert_array_equal(other.step(action)[0], expected[0])
@@ -172,6 +179,46 @@ def test_a_copy_goes_on_from_where_it_was_made(env_id):
         np.testing.assert_array_equal(other.reset()[0], start)
         other.close()
     env.close()
+
+
+def test_no_start_is_within_something():
+    env = FrankaPegInHole(start_noise=0.3)  # more than its own, so that many would be
+    assert max(env.reset(seed=seed) and env.arm.penetration() for seed in range(200)) < 1e-3
+    env.close()
+
+
+@pytest.mark.parametrize("y", [0.04, 0.2, 0.4, 0.52])
+def test_the_door_cannot_be_opened_from_outside(y):
+    env = FrankaCabinetOpen()
+    observation, _ = env.reset(seed=0)
+    for step in range(60):
+        x = -0.2 if 10 < step < 40 else -0.65
+        observation, _, terminated, _, _ = env.step(towards(env, (x, y, 0.6), FORWARDS))
+        assert not terminated and -0.05 < observation[6] < 0.15  # friction moves it a little
+    env.close()
+
+
+def test_the_layer_is_where_the_hand_was_when_the_door_began_to_open():
+    env = FrankaCabinetOpen()
+    env.reset(seed=0)
+    angles = iter([0.02, 0.06, 0.2, 0.02, 0.3, 0.41])
+    heights = [0.7, 0.6, 0.4, 0.3, 0.3, 0.8]
+    modes = []
+    for height in heights:
+        env.arm.client.resetJointState(env._door, 0, next(angles))
+        env._follow(np.array([0, 0, height]), np.array([0, 0, height]))
+        modes.append(env._done_by())
+    assert modes == [None] * 5 + ["down"]
+    env.close()
+
+
+def test_a_closed_environment_says_so():
+    env = FrankaReach()
+    env.reset()
+    env.close()
+    for use in (env.reset, lambda: env.step(np.zeros(7))):
+        with pytest.raises(RuntimeError, match="FrankaReach is closed"):
+            use()
 
 
 def test_start_noise():
@@ -232,7 +279,7 @@ def test_bad_arguments():
     env = FrankaReach()
     env.reset()
     for action in (np.zeros(6), np.full(7, np.nan)):
-        with pytest.raises(ValueError, match=r"action: shape .* given; accepted are finite numbers of shape \(7,\)"):
+        with pytest.raises(ValueError, match=r"action: \[.*\] given; accepted are finite numbers of shape \(7,\)"):
             env.step(action)
     with pytest.raises(ValueError, match="options"):
         env.reset(options={"goal": 1})

@@ -99,12 +99,44 @@ def test_a_dead_worker_is_reported_and_does_not_hang(fragile, cause):
     assert time.perf_counter() - started < 20 and not any(process.is_alive() for process in fragile.processes)
 
 
+def test_what_an_environment_lacks_does_no_harm(fragile):
+    with pytest.raises(AttributeError, match=r"(?s)Environment 1 raised an error.*no_such_thing"):
+        fragile.get_attr("no_such_thing", indices=[1, 3])
+    fragile.step(np.zeros((5, 1), dtype=np.float32))
+    with pytest.raises(RuntimeError, match="Environment 4 raised an error"):
+        fragile.env_method("reset", options=3, no_such_argument=1, indices=[4])
+    with pytest.raises(RuntimeError, match="The environments are closed"):
+        fragile.step(np.zeros((5, 1), dtype=np.float32))
+
+
+def test_what_nobody_heard_is_not_taken_for_the_next_answer(fragile):
+    """As after an interrupt between a question and its answer."""
+    single = DummyVecEnv([TwoEnds] * 5)
+    for env in (fragile, single):
+        env.seed(0)
+        env.reset()
+    fragile.step_async(np.full((5, 1), 0.5, dtype=np.float32))
+    single.step(np.full((5, 1), 0.5, dtype=np.float32))
+    for action in (0.1, -0.2, 0.3):
+        ours, theirs = (env.step(np.full((5, 1), action, dtype=np.float32))[0] for env in (fragile, single))
+        np.testing.assert_array_equal(ours, theirs)
+    fragile.step_async(np.zeros((5, 1), dtype=np.float32))
+    assert fragile.reset().shape == (5, 2)
+
+
+def test_workers_leave_ctrl_c_to_their_parent(fragile):
+    for process in fragile.processes:
+        os.kill(process.pid, signal.SIGINT)
+    time.sleep(0.2)
+    fragile.step(np.zeros((5, 1), dtype=np.float32))
+
+
 def test_an_environment_that_cannot_be_made():
     def broken():
         raise FileNotFoundError("no such robot")
 
-    with pytest.raises(RuntimeError, match=r"(?s)Environment \d raised an error:.*no such robot"):
-        WorkerVecEnv([TwoEnds, broken, TwoEnds], n_workers=3)
+    with pytest.raises(RuntimeError, match=r"(?s)Environment 3 raised an error:.*no such robot"):
+        WorkerVecEnv([TwoEnds, TwoEnds, TwoEnds, broken], n_workers=2)
 
 
 def test_a_script_without_guard_is_told(tmp_path):
@@ -130,6 +162,18 @@ def test_bad_arguments():
         WorkerVecEnv([TwoEnds], n_workers=0)
 
 
+def test_an_arm_under_a_users_own_id():
+    pytest.importorskip("pybullet")
+    gym.register("MyReach-v0", entry_point="sb3_ddiffpg.envs.franka.tasks:FrankaReach", max_episode_steps=7)
+    for n_envs in (1, 2):
+        env = make_vec_env("MyReach-v0", n_envs, n_threads=2)
+        assert env.reset().shape == (n_envs, 6) and env.get_attr("spec")[0].max_episode_steps == 7
+        env.close()
+    del gym.registry["MyReach-v0"]
+    with pytest.raises(ValueError, match="n_envs: 0 given"):
+        make_vec_env("FrankaReach-v0", 0)
+
+
 def test_franka_in_workers():
     pytest.importorskip("pybullet")
     ours = make_vec_env("FrankaDrawerClose-v0", 4, seed=1, n_threads=2, max_episode_steps=6)
@@ -142,6 +186,7 @@ def test_franka_in_workers():
         actions = rng.uniform(-1, 1, (4, 7)).astype(np.float32)
         for part, other in zip(ours.step(actions)[:3], single.step(actions)[:3], strict=True):
             np.testing.assert_array_equal(part, other)
+    assert ours.render_mode is None and make_vec_env("FrankaReach-v0").render_mode is None
     assert ours.get_attr("spec", 0)[0].id == "FrankaDrawerClose-v0"
     assert ours.get_attr("mode_features", 2)[0].tolist() == [0, 1, 2]
     ours.close()

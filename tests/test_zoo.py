@@ -244,8 +244,11 @@ def test_a_configuration_of_ours_by_name(tmp_path):
     main(["train", "--conf-file", "ddiffpg-cpu", *options])
     config = yaml.unsafe_load((tmp_path / "ddiffpg" / "AntMazeV1-v0_1" / "AntMazeV1-v0" / "config.yml").read_text())
     assert config["env_kwargs"] == {"integrator": "euler"} and config["n_envs"] == 4
-    with pytest.raises(FileNotFoundError, match=r"no\.yml"):
-        main(["train", "--env", ENV, "--conf-file", "no.yml", "-f", str(tmp_path)])
+    for name in ("no.yml", "ddiffpg-gpu"):
+        with pytest.raises(SystemExit, match=rf"--conf-file: '{name}' given; accepted are .* \['ddiffpg', 'ddiffpg-cpu'\]"):
+            main(["train", "--env", ENV, "--conf-file", name, "-f", str(tmp_path)])
+    with pytest.raises(ValueError, match="Hyperparameters not found for ddiffpg-PointMazeV1-v0"):
+        main(["train", "--env", ENV, "--conf-file", "ddiffpg-cpu", "-f", str(tmp_path)])
 
 
 def test_papers_numbers():

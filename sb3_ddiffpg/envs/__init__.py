@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.env_util import make_vec_env as make_sb3_vec_env
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from sb3_ddiffpg.envs.mazes import LISTED_ROUTES, MAZES, HomotopyTracker, Maze, reduce_word
 from sb3_ddiffpg.envs.point import PointMazeEnv, PointMazeVecEnv
@@ -67,8 +67,12 @@ def make_vec_env(
     if module:
         import_module(module)
     spec = gym.spec(name)
-    if str(spec.entry_point).startswith(_FRANKA) and n_envs > 1:
-        workers = WorkerVecEnv([partial(gym.make, f"sb3_ddiffpg.envs:{name}", **env_kwargs)] * n_envs, n_threads)
+    if n_envs < 1:
+        raise ValueError(f"n_envs: {n_envs} given; accepted are whole numbers from 1 up")
+    if str(spec.entry_point).startswith(_FRANKA):
+        # The spec, not the id: the workers do not know what was registered here
+        makers: list[Any] = [partial(gym.make, spec, **env_kwargs)] * n_envs
+        workers: VecEnv = WorkerVecEnv(makers, n_threads) if n_envs > 1 else DummyVecEnv(makers)
         if seed is not None:
             workers.action_space.seed(seed)
         workers.seed(seed)

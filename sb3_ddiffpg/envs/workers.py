@@ -2,15 +2,19 @@
 
 import multiprocessing
 import os
+import signal
 import traceback
 from collections.abc import Callable, Sequence
+from functools import partial
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from sb3_ddiffpg.interrupts import uninterrupted
 
 
 def n_processors() -> int:
@@ -27,17 +31,18 @@ def _failing_env(error: BaseException) -> int:
 
 
 def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper) -> None:
-    """What a worker does: it answers each command with ``("ok", result)`` or ``("error", (environment, text))``."""
+    """What a worker does: it answers each command with ``("ok", result)`` or ``("error", (environment, error, text))``."""
     parent.close()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent says what happens now
     envs: DummyVecEnv | None = None
     while True:
         try:
             command, argument = remote.recv()
-        except (EOFError, KeyboardInterrupt):
-            break  # the parent is gone, or says what happens now
+        except EOFError:
+            break  # the parent is gone
         try:
             if command == "make":
-                envs = DummyVecEnv(wrapped.var)
+                envs = _make(wrapped.var)
                 result: Any = (envs.observation_space, envs.action_space, envs.render_mode)
             elif command == "close":
                 break
@@ -45,10 +50,17 @@ def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper) -
                 result = _answer(envs, command, argument)
             remote.send(("ok", result))
         except Exception as error:
-            remote.send(("error", (_failing_env(error), traceback.format_exc())))
+            remote.send(("error", (_failing_env(error), type(error), traceback.format_exc())))
     if envs is not None:
         envs.close()
     remote.close()
+
+
+def _make(env_fns: Sequence[Callable[[], gym.Env]]) -> DummyVecEnv:
+    made = []
+    for env_idx, make in enumerate(env_fns):  # noqa: B007 - the name by which a failing one is found
+        made.append(make())
+    return DummyVecEnv([partial(made.__getitem__, i) for i in range(len(made))])
 
 
 def _answer(envs: Any, command: str, argument: Any) -> Any:
@@ -58,7 +70,13 @@ def _answer(envs: Any, command: str, argument: Any) -> Any:
     if command == "step":
         return *envs.step(argument), envs.reset_infos
     name, arguments, keywords = argument
-    return getattr(envs, name)(*arguments, **keywords)
+    indices = keywords.pop("indices", None)
+    if indices is None:
+        return getattr(envs, name)(*arguments, **keywords)
+    answers = []
+    for env_idx in indices:
+        answers.append((getattr(envs, name)(*arguments, **keywords, indices=[env_idx]) or [None])[0])
+    return answers
 
 
 class WorkerVecEnv(VecEnv):
@@ -97,6 +115,8 @@ class WorkerVecEnv(VecEnv):
             theirs.close()
             self.remotes.append(remote)
             self.processes.append(process)
+        #: Answers that each worker still owes
+        self._owed = [0] * n_workers
         observation_space, action_space, self.render_mode = self._ask("make", [None] * n_workers)[0]
         self._made = True
         super().__init__(len(env_fns), observation_space, action_space)
@@ -108,29 +128,44 @@ class WorkerVecEnv(VecEnv):
         return self._hear()
 
     def _tell(self, command: str, arguments: Sequence[Any]) -> None:
+        if self._closed:
+            raise RuntimeError("The environments are closed")
         for worker, (remote, argument) in enumerate(zip(self.remotes, arguments, strict=True)):
+            while self._owed[worker]:  # somebody was interrupted before he heard it
+                self._hear_one(worker)
             try:
-                remote.send((command, argument))
-            except (BrokenPipeError, ConnectionResetError, OSError):
+                with uninterrupted():
+                    remote.send((command, argument))
+                    self._owed[worker] += 1
+            except OSError:
                 self._fail(worker)
 
     def _hear(self) -> list[Any]:
-        results = []
-        for worker, (remote, process) in enumerate(zip(self.remotes, self.processes, strict=True)):
-            wait([remote, process.sentinel])
-            try:
-                # An answer may still lie in the pipe of a worker that has ended since
-                status, result = remote.recv() if remote.poll() else self._fail(worker)
-            except (EOFError, ConnectionResetError):
-                self._fail(worker)
+        answers = [self._hear_one(worker) for worker in range(len(self.remotes))]
+        for worker, (status, result) in enumerate(answers):
             if status == "error":
-                env, text = result
+                env, kind, text = result
+                if issubclass(kind, AttributeError):
+                    raise AttributeError(f"Environment {self.first[worker] + env} raised an error:\n{text}")
                 self.close()
                 raise RuntimeError(f"Environment {self.first[worker] + env} raised an error:\n{text}")
-            results.append(result)
-        return results
+        return [result for _, result in answers]
 
-    def _fail(self, worker: int) -> Any:
+    def _hear_one(self, worker: int) -> tuple[str, Any]:
+        remote = self.remotes[worker]
+        wait([remote, self.processes[worker].sentinel])
+        try:
+            # An answer may still lie in the pipe of a worker that has ended since
+            if remote.poll():
+                with uninterrupted():
+                    answer: tuple[str, Any] = remote.recv()
+                    self._owed[worker] -= 1
+                    return answer
+        except (EOFError, ConnectionResetError):
+            pass
+        return self._fail(worker)
+
+    def _fail(self, worker: int) -> NoReturn:
         process = self.processes[worker]
         process.join(timeout=5)
         code, first, last = process.exitcode, self.first[worker], self.first[worker + 1] - 1
@@ -201,7 +236,7 @@ class WorkerVecEnv(VecEnv):
         by_env = {
             first + i: value
             for (first, _), part, values in zip(self._ranges(), local, answers, strict=True)
-            for i, value in zip(part, values or [None] * len(part), strict=True)
+            for i, value in zip(part, values, strict=True)
         }
         return [by_env[i] for i in chosen]
 

@@ -125,23 +125,14 @@ class PandaArm:
         orientation = self.client.getLinkState(self.body, _GRASP, computeForwardKinematics=1)[5]
         return np.array(self.client.getMatrixFromQuaternion(orientation)).reshape(3, 3)[:, 2]
 
-    def snapshot(self) -> bytes:
+    def penetration(self) -> float:
         """
-        :return: positions, velocities and contacts of all bodies
+        :return: how deep the arm is in anything else where it now stands, in metres
         """
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "world.bullet"
-            self.client.saveBullet(str(path))
-            return path.read_bytes()
-
-    def restore(self, snapshot: bytes) -> None:
-        """
-        :param snapshot: of a world with the same bodies
-        """
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "world.bullet"
-            path.write_bytes(snapshot)
-            self.client.restoreState(fileName=str(path))
+        self.client.performCollisionDetection()
+        return max(
+            (-contact[8] for contact in self.client.getContactPoints(self.body) if contact[2] != self.body), default=0.0
+        )
 
     def close(self) -> None:
         """Release the world."""

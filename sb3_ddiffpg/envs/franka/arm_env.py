@@ -53,6 +53,9 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         size = 6 + self.n_extra + 7 * obs_joints
         self.observation_space = spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (7,), dtype=np.float32)
+        # How the running episode began, and what was done since
+        self._start: FloatArray | None = None
+        self._actions: list[FloatArray] = []
         self._make_world()
 
     def _make_world(self) -> None:
@@ -63,15 +66,17 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         self._fresh = self.arm.client.saveState()
 
     def __getstate__(self) -> dict[str, Any]:
-        """A world stays in its process: what is pickled or copied is how things stand in it."""
-        state = {name: value for name, value in self.__dict__.items() if name not in ("arm", "_fresh")}
-        return {**state, "_world": self.arm.snapshot()}
+        """A world stays in its process: what is pickled or copied is how the episode has gone so far."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("arm", "_fresh")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        world = state.pop("_world")
+        actions = state["_actions"]
         self.__dict__.update(state)
         self._make_world()
-        self.arm.restore(world)
+        if self._start is not None:
+            self._start_episode(self._start)
+            for action in actions:  # bullet forgets contacts when it saves a world: going the way again is exact
+                self._move(action)
 
     # ------------------------------------------------------------------ what a task is
 
@@ -107,11 +112,23 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         super().reset(seed=seed)
         if options:
             raise ValueError(f"options: {sorted(options)} given; there are none")
-        self.arm.client.restoreState(self._fresh)
-        noise = self.start_noise * self.np_random.uniform(-1.0, 1.0, 7)
-        self.arm.reset(np.clip(np.array(self.start_angles) + noise, self.arm.low, self.arm.high))
-        self._begin()
+        self._check_open()
+        for _ in range(100):  # a start within something else would be flung out of it
+            noise = self.start_noise * self.np_random.uniform(-1.0, 1.0, 7)
+            self._start_episode(np.clip(np.array(self.start_angles) + noise, self.arm.low, self.arm.high))
+            if self.arm.penetration() < 1e-3:
+                break
         return self._observation(), {}
+
+    def _start_episode(self, angles: FloatArray) -> None:
+        self._start, self._actions = angles, []
+        self.arm.client.restoreState(self._fresh)
+        self.arm.reset(angles)
+        self._begin()
+
+    def _check_open(self) -> None:
+        if not self.arm.client.isConnected():
+            raise RuntimeError(f"{type(self).__name__} is closed: make another")
 
     def step(self, action: npt.NDArray[Any]) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """
@@ -121,14 +138,19 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         """
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (7,) or not np.isfinite(action).all():
-            raise ValueError(f"action: shape {action.shape} given; accepted are finite numbers of shape (7,)")
-        before, _ = self.arm.end_effector()
-        self.arm.step(np.clip(action, -1.0, 1.0))
-        after, _ = self.arm.end_effector()
-        self._follow(before, after)
+            raise ValueError(f"action: {action.tolist()} given; accepted are finite numbers of shape (7,)")
+        self._check_open()
+        self._move(np.clip(action, -1.0, 1.0))
         mode = self._done_by()
         done = mode is not None
         return self._observation(), float(done), done, False, {"is_success": done, "mode": mode}
+
+    def _move(self, action: FloatArray) -> None:
+        self._actions.append(action)
+        before, _ = self.arm.end_effector()
+        self.arm.step(action)
+        after, _ = self.arm.end_effector()
+        self._follow(before, after)
 
     def _observation(self) -> npt.NDArray[np.float32]:
         position, velocity = self.arm.end_effector()

@@ -140,19 +140,20 @@ class FrankaDrawerClose(FrankaEnv):
 class FrankaCabinetOpen(FrankaEnv):
     """
     Open a cabinet's door, which leaves a gap at its free edge, by reaching in and pulling from behind. A shelf divides the
-    cabinet: the mode is where the fingertips are when the door is open, ``"up"`` above the shelf or ``"down"`` below it. The
-    door's angle (rad) is observed.
+    cabinet: the mode is where the fingertips are when the door begins to open, ``"up"`` above the shelf or ``"down"`` below.
+    The door's angle (rad) is observed.
     """
 
     listed_modes = ("up", "down")
     base_x = -0.9
     start_angles = (-0.2, -0.5, 0.0, -2.6, 0.0, 2.2, 0.79)
-    force_scale = 100.0
+    # Much stronger ones press the hand through the door
+    force_scale = 10.0
     n_extra = 1
     looks_at = (-0.4, 0.0, 0.5)
     CENTER, SIZE, PLATE = (-0.22, 0.1, 0.53), (0.33, 1.0, 0.86), 0.02
     HINGE_Y, DOOR_WIDTH, DOOR_HEIGHT = 0.45, 0.45, 0.82
-    OPEN, BRAKE = 0.4, 0.5
+    OPENS, OPEN, BRAKE = 0.05, 0.4, 0.5
 
     def _build(self) -> None:
         (x, y, z), (depth, width, height), plate = self.CENTER, self.SIZE, self.PLATE
@@ -161,22 +162,26 @@ class FrankaCabinetOpen(FrankaEnv):
             self._add_box((x, y + side * width, z), (depth, plate, height), WOOD)
         for level in (-0.5, 0.0, 0.5):
             self._add_box((x, y, z + level * height), (depth, width, plate), WOOD)
-        # In front of the shelf's edge, against its stop: a push from outside does nothing
+        front, panel, end = x - depth / 2 - 0.75 * plate, self.HINGE_Y + plate, y + width / 2
+        self._add_box((front, (panel + end) / 2, z), (plate, end - panel, height), WOOD)
         frame = link("base", (0.01, 0.01, 0.01), (0.0, 0.0, 0.0), STEEL)
         door = link("door", (plate, self.DOOR_WIDTH, self.DOOR_HEIGHT), (0.0, -self.DOOR_WIDTH / 2, 0.0), STEEL)
         hinge = joint("revolute", "door", (0.0, 0.0, -1.0), (0.0, 0.0, 0.0), 1.6)
-        urdf = f"<robot name='door'>{frame}{door}{hinge}</robot>"
-        self._door = self.arm.load(urdf, (x - depth / 2 - 0.75 * plate, self.HINGE_Y, z))
+        self._door = self.arm.load(f"<robot name='door'>{frame}{door}{hinge}</robot>", (front, self.HINGE_Y, z))
         self._brake(self._door, 0, self.BRAKE)
 
     def _begin(self) -> None:
         self.arm.client.resetJointState(self._door, 0, 0.0)
+        self._layer = ""
 
     def _extra(self) -> FloatArray:
         return np.array([self.arm.client.getJointState(self._door, 0)[0]])
 
+    def _follow(self, before: FloatArray, after: FloatArray) -> None:
+        if self._extra()[0] < self.OPENS:
+            self._layer = ""
+        elif not self._layer:
+            self._layer = "up" if before[2] > self.CENTER[2] else "down"
+
     def _done_by(self) -> str | None:
-        if self._extra()[0] < self.OPEN:
-            return None
-        height = self.arm.end_effector()[0][2]
-        return "up" if height > self.CENTER[2] else "down"
+        return self._layer if self._extra()[0] >= self.OPEN else None
