@@ -2,11 +2,21 @@
 
 import sb3_ddiffpg.envs  # noqa: F401 - registers the environments
 from sb3_ddiffpg.buffers import ModeReplayBuffer
-from sb3_ddiffpg.callbacks import ClusteringCallback, ModeEvalCallback
+from sb3_ddiffpg.callbacks import ClusteringCallback, EvaluateModesCallback, ModeEvalCallback, ModeFigureCallback
 from sb3_ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.modes import Mode, ModeTable
 from sb3_ddiffpg.policies import DiffusionPolicy
 
 __version__ = "0.1.0"
 
-__all__ = ["ClusteringCallback", "DDiffPG", "DiffusionPolicy", "Mode", "ModeEvalCallback", "ModeReplayBuffer", "ModeTable"]
+__all__ = [
+    "ClusteringCallback",
+    "DDiffPG",
+    "DiffusionPolicy",
+    "EvaluateModesCallback",
+    "Mode",
+    "ModeEvalCallback",
+    "ModeFigureCallback",
+    "ModeReplayBuffer",
+    "ModeTable",
+]

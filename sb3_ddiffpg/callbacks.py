@@ -1,11 +1,18 @@
 """When to re-cluster, and what evaluation during training shows of the modes."""
 
+import json
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.logger import Figure
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
+from sb3_ddiffpg.episodes import run_episodes
+from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
 from sb3_ddiffpg.history import ModeEvent
 from sb3_ddiffpg.trajectories import read_success
 
@@ -86,3 +93,106 @@ class ModeEvalCallback(EvalCallback):
     def _on_step(self) -> bool:
         self._labels = set()
         return super()._on_step()
+
+
+class EvaluateModesCallback(BaseCallback):
+    """
+    Runs :func:`~sb3_ddiffpg.evaluation.evaluate_modes` during training and logs what follows from it under ``eval_modes/``.
+    Give it environments with one fixed start.
+
+    :param eval_env: Environments used for evaluation
+    :param eval_freq: Environment steps between two evaluations
+    :param n_episodes: Episodes for each command, and twice as many without
+    :param path: Of a file to which each evaluation is appended, one line of JSON each
+    :param kwargs: Further arguments of ``evaluate_modes``
+    """
+
+    def __init__(
+        self, eval_env: VecEnv, eval_freq: int = 10_000, n_episodes: int = 20, path: str | Path | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__()
+        if eval_freq < 1:
+            raise ValueError(f"eval_freq must be at least 1, got {eval_freq}")
+        self.eval_env, self.eval_freq, self.n_episodes, self.kwargs = eval_env, eval_freq, n_episodes, kwargs
+        self.path = None if path is None else Path(path)
+        #: Environment steps and what was found
+        self.evaluations: list[tuple[int, ModeEvaluation]] = []
+        self._next = 0
+
+    def _init_callback(self) -> None:
+        self._next = self.num_timesteps + self.eval_freq
+        if self.path is not None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if self.num_timesteps >= self._next:
+            self._next = self.num_timesteps + self.eval_freq
+            self._evaluate()
+
+    def _evaluate(self) -> None:
+        if isinstance(self.training_env, VecNormalize):
+            sync_envs_normalization(self.training_env, self.eval_env)
+        found = evaluate_modes(self.model, self.eval_env, self.n_episodes, **self.kwargs)
+        self.evaluations.append((self.num_timesteps, found))
+        values = {
+            "expected_modes": found.expected_modes(),
+            "robust_modes": found.robust_modes,
+            "effective_modes": found.effective_modes,
+            "coverage": found.coverage,
+            "control_accuracy": found.control_accuracy,
+            "success_rate": found.uncommanded.success_rate,
+            **{f"{each.mode}/success_rate": each.success_rate for each in found.commanded},
+        }
+        for name, value in values.items():
+            self.logger.record(f"eval_modes/{name}", value)
+        self.logger.dump(self.num_timesteps)
+        if self.path is not None:
+            with self.path.open("a") as file:
+                file.write(json.dumps({"step": self.num_timesteps, **found.to_dict()}) + "\n")
+
+
+class ModeFigureCallback(BaseCallback):
+    """
+    Shows the pictures of :mod:`~sb3_ddiffpg.plots` in TensorBoard during training. Needs the extra ``plots``.
+
+    :param figure_freq: Environment steps between two sets of pictures
+    :param eval_env: Environments in which the modes' routes are run, with one fixed start; None: no picture of routes
+    :param n_episodes: Episodes for each mode's routes
+    """
+
+    def __init__(self, figure_freq: int = 50_000, eval_env: VecEnv | None = None, n_episodes: int = 5) -> None:
+        super().__init__()
+        if figure_freq < 1:
+            raise ValueError(f"figure_freq must be at least 1, got {figure_freq}")
+        # Not at the top: matplotlib is not needed to train
+        from sb3_ddiffpg import pictures
+
+        self._draw: Callable[..., dict[str, Any]] = pictures.draw_all
+        self.figure_freq, self.eval_env, self.n_episodes = figure_freq, eval_env, n_episodes
+        self._next = 0
+
+    def _init_callback(self) -> None:
+        self._next = self.num_timesteps + self.figure_freq
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if self.num_timesteps < self._next:
+            return
+        self._next = self.num_timesteps + self.figure_freq
+        episodes = None
+        model: Any = self.model
+        if self.eval_env is not None and len(model.modes):
+            if isinstance(self.training_env, VecNormalize):
+                sync_envs_normalization(self.training_env, self.eval_env)
+            episodes = {name: run_episodes(model, self.eval_env, self.n_episodes, mode=name) for name in model.modes.names}
+        maze = self.training_env.get_attr("maze", indices=0)[0] if self.training_env.has_attr("maze") else None
+        observation: Any = model._last_obs
+        first = None if observation is None or isinstance(observation, dict) else np.asarray(observation)[0]
+        for name, figure in self._draw(model, maze, first, episodes).items():
+            self.logger.record(f"figures/{name}", Figure(figure, close=True), exclude=("stdout", "log", "json", "csv"))
+        self.logger.dump(self.num_timesteps)

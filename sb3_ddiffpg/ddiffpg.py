@@ -25,7 +25,7 @@ from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, Behavior
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.callbacks import ClusteringCallback, contains_clustering
 from sb3_ddiffpg.critics import ModeCritics
-from sb3_ddiffpg.features import declared_mode_features, same_selection
+from sb3_ddiffpg.features import declared_cell_size, declared_mode_features, describe_env, same_selection
 from sb3_ddiffpg.history import ModeHistory
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, noveld_reward
 from sb3_ddiffpg.mode_control import ModeControl
@@ -35,6 +35,7 @@ from sb3_ddiffpg.policies import DiffusionActor, DiffusionPolicy
 from sb3_ddiffpg.target_actions import ascend
 from sb3_ddiffpg.trajectories import NO_MODE, Trajectory
 from sb3_ddiffpg.validation import check_arguments
+from sb3_ddiffpg.visits import VisitMap
 
 SelfDDiffPG = TypeVar("SelfDDiffPG", bound="DDiffPG")
 
@@ -273,6 +274,8 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         self._modes: list[Mode] = []
         self._next_mode_number = 0
         self.mode_history = ModeHistory()
+        self.visits: VisitMap | None = None
+        self.env_spec: str | None = None
         self._behavior = Behavior(0)
         self._resolved_features: Any = None
         self._warned_support = False
@@ -318,6 +321,10 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
             deviations = {} if noise is None else {"low": noise.low, "high": noise.high}
             action_dim = int(np.prod(self.action_space.shape or (1,)))
             self.action_noise = SpreadNormalActionNoise(self.n_envs, action_dim, **deviations)
+        if self.visits is None and self.replay_buffer.features.dim <= 3:
+            self.visits = VisitMap(self.replay_buffer.features.dim, declared_cell_size(self.env))
+        if self.env is not None:
+            self.env_spec = describe_env(self.env)
         measure = NOVELTY_MEASURES[self.novelty] if isinstance(self.novelty, str) else self.novelty
         self.novelty_model: Any = measure(
             self.replay_buffer.features.dim, self.policy.actor.features_dim, **(self.novelty_kwargs or {})
@@ -562,6 +569,8 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         super()._store_transition(replay_buffer, *args, **kwargs)
         positions = th.as_tensor(replay_buffer.last_positions(), device=self.device)
         self.novelty_model.observe(positions)
+        if self.visits is not None:
+            self.visits.observe(replay_buffer.last_positions())
         for env, trajectory in replay_buffer.just_finished:
             mode = self._behavior.commanded_mode(env)
             if mode is not None:

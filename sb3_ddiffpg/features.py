@@ -71,6 +71,27 @@ def declared_mode_features(env: VecEnv) -> Any:
     )
 
 
+def declared_cell_size(env: VecEnv | None) -> float:
+    """
+    :param env: The environments
+    :return: The edge of the cells in which visits are counted: their ``cell_size``, else 0.5
+    """
+    declared = env is not None and env.has_attr("cell_size")
+    return float(env.get_attr("cell_size", indices=0)[0]) if declared else 0.5  # type: ignore[union-attr]
+
+
+def describe_env(env: VecEnv) -> str | None:
+    """
+    :param env: The environments
+    :return: Their specification as JSON, from which ``gymnasium.make`` makes another; None if they have none
+    """
+    spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
+    try:
+        return None if spec is None else spec.to_json()
+    except ValueError:  # arguments that JSON cannot hold
+        return None
+
+
 def same_selection(first: Any, second: Any) -> bool:
     """
     :param first: A selection of mode features

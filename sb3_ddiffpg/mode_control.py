@@ -16,6 +16,7 @@ from sb3_ddiffpg.modes import Mode, ModeTable, default_name
 from sb3_ddiffpg.policies import DiffusionPolicy
 from sb3_ddiffpg.reclustering import Reclustering, find_modes
 from sb3_ddiffpg.trajectories import NO_MODE
+from sb3_ddiffpg.visits import VisitMap
 
 # A name stands in tables, tags of a log and on command lines, where a number would be an index
 _NAME = re.compile(r"(?=.*[^\W\d])[\w .+-]{1,40}")
@@ -32,6 +33,7 @@ class ModeControl:
     logger: Logger
     num_timesteps: int
     mode_history: ModeHistory
+    visits: VisitMap | None
     min_mode_size: int
     max_modes: int
     mode_patience: int
@@ -77,6 +79,8 @@ class ModeControl:
             events = self._replace_modes(found)
             found.describe(self._modes, self.replay_buffer)
             self.mode_history.note(self.num_timesteps, self._modes)
+            if self.visits is not None:
+                self.visits.note(self.num_timesteps)
         self.logger.record("modes/n_modes", len(self._modes))
         for mode in self._modes:
             self.logger.record(f"modes/{mode.name}/n_trajectories", mode.n_trajectories)

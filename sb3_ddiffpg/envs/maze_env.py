@@ -16,6 +16,8 @@ from sb3_ddiffpg.envs.drawing import Image
 from sb3_ddiffpg.envs.maze_simulation import MazeSimulation
 from sb3_ddiffpg.envs.mazes import MazeMap
 
+#: Edge of the floor's cells in which visits are counted, in metres
+VISIT_CELL = 1.0
 # A step takes 0.1 s, whatever the body
 _METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
@@ -58,6 +60,7 @@ class MazeEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         #: Indices of the position in the observation.
         self.mode_features = np.array([0, 1])
         self.listed_modes = self.maze.listed_routes
+        self.cell_size = VISIT_CELL
         self.observation_space = self.simulation.observation_space()
         self.action_space = self.simulation.action_space()
         self.render_mode = render_mode
@@ -129,6 +132,7 @@ class MazeVecEnv(VecEnv):
         self.maze = self.simulation.maze
         self.mode_features = np.array([0, 1])
         self.listed_modes = self.maze.listed_routes
+        self.cell_size = VISIT_CELL
         self.max_episode_steps = max_episode_steps
         self.spec: EnvSpec | None = None
         # VecEnv's constructor asks get_attr for the render mode

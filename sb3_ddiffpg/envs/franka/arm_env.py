@@ -32,6 +32,8 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
     base_x: ClassVar[float]
     start_angles: ClassVar[tuple[float, ...]]
     default_start_noise: ClassVar[float] = 0.0
+    #: Edge of the cells in which visits of the fingertips are counted, in metres
+    cell_size: ClassVar[float] = 0.05
     #: The ways of doing it
     listed_modes: ClassVar[tuple[str, ...]]
     force_scale: ClassVar[float] = 1.0

@@ -1,0 +1,299 @@
+"""
+One page about a trained model, without network: ``python -m sb3_ddiffpg.report MODEL.zip --output PAGE.html``. Needs the extra
+``plots``.
+"""
+
+import argparse
+import base64
+import inspect
+import io
+import json
+import platform
+import re
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import imageio.v3 as imageio
+import jinja2
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from matplotlib.colors import to_hex
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_ddiffpg import pictures, plots
+from sb3_ddiffpg.ddiffpg import DDiffPG
+from sb3_ddiffpg.envs import make_vec_env
+from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
+
+_PACKAGES = ("sb3_ddiffpg", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy")
+# Of an evaluation's episodes, so many are drawn for each mode
+_ROUTES_DRAWN = 20
+
+
+@dataclass(frozen=True)
+class Task:
+    """
+    The environment in which a model is shown.
+
+    :param id: Of the environment
+    :param kwargs: Arguments of ``gym.make``
+    """
+
+    id: str
+    kwargs: dict[str, Any]
+
+    @staticmethod
+    def of(model: DDiffPG, env_id: str | None = None, env_kwargs: dict[str, Any] | None = None) -> "Task":
+        """
+        :param model: A trained model, which remembers where
+        :param env_id: Of another environment; where the model was trained when None
+        :param env_kwargs: Further arguments of ``gym.make``
+        :return: The task, from one fixed start if it is one of this package
+        :raises ValueError: If there is no such environment, or nobody knows which
+        """
+        kwargs: dict[str, Any] = {}
+        if env_id is None:
+            if model.env_spec is None:
+                raise ValueError("--env: not given, and the model does not remember the environment in which it was trained")
+            spec = EnvSpec.from_json(model.env_spec)
+            env_id, kwargs = spec.id, {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
+            kwargs = {name: value for name, value in kwargs.items() if name != "render_mode" and value is not None}
+        if env_id not in gym.registry:
+            raise ValueError(f"--env: {env_id!r} is not registered")
+        if str(gym.spec(env_id).entry_point).startswith("sb3_ddiffpg."):
+            kwargs["start_noise"] = 0.0
+        return Task(env_id, {**kwargs, **(env_kwargs or {})})
+
+    def make(self, n_envs: int, seed: int) -> VecEnv:
+        """
+        :param n_envs: Number of environments
+        :param seed: Of the first
+        :return: The environments
+        """
+        return make_vec_env(self.id, n_envs, seed=seed, **self.kwargs)
+
+
+def film(model: DDiffPG, task: Task, mode: str | None, seed: int, max_frames: int = 400) -> tuple[np.ndarray, int]:
+    """
+    One episode in pictures.
+
+    :param model: A trained model
+    :param task: Where
+    :param mode: The mode to command
+    :param seed: Of the environment
+    :param max_frames: The film ends after so many
+    :return: Frames, shape [T, height, width, 3], and frames in a second
+    :raises ValueError: If the environment draws no pictures
+    """
+    env = gym.make(task.id, render_mode="rgb_array", **task.kwargs)
+    observation, _ = env.reset(seed=seed)
+    frames, done = [env.render()], False
+    while not done and len(frames) < max_frames:
+        action, _ = model.predict(observation, mode=mode)
+        observation, _, terminated, truncated, _ = env.step(action)
+        frames.append(env.render())
+        done = terminated or truncated
+    rate = int(env.metadata.get("render_fps", 20))
+    env.close()
+    if not isinstance(frames[0], np.ndarray):
+        raise ValueError(f"{task.id} gives no picture of shape [height, width, 3]")
+    height, width = (size - size % 2 for size in frames[0].shape[:2])  # what the codec wants
+    return np.stack(frames)[:, :height, :width], rate  # type: ignore[arg-type]
+
+
+def make_report(
+    model: DDiffPG,
+    output: str | Path,
+    task: Task,
+    n_episodes: int = 100,
+    seed: int = 0,
+    videos: bool = True,
+    title: str | None = None,
+    source: str = "MODEL.zip",
+) -> ModeEvaluation:
+    """
+    Evaluate a model, draw it, and write a page of HTML that needs no other file and no network. Videos lie beside it too.
+
+    :param model: A trained model; with its replay buffer there are more pictures
+    :param output: The page
+    :param task: Where it is evaluated
+    :param n_episodes: Episodes for each mode
+    :param seed: Of the evaluation
+    :param videos: Whether to film an episode of each mode
+    :param title: Of the page
+    :param source: Name of the model's file, for the command that makes this page
+    :return: The evaluation
+    """
+    output = Path(output)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    env = task.make(min(n_episodes, 25), seed)
+    found = evaluate_modes(model, env, n_episodes, seed=seed)
+    first: Any = env.reset()
+    maze = env.get_attr("maze", indices=0)[0] if env.has_attr("maze") else None
+    env.close()
+    observation = None if isinstance(first, dict) else first[0]
+    drawn = {name: runs[:_ROUTES_DRAWN] for name, runs in found.episodes.items() if name != "(none)"}
+    values = model.mode_values(first)[0] if len(model.modes) else np.zeros(0)
+    films = []
+    for name in model.modes.names if videos else ():
+        path = output.with_name(f"{output.stem}-{re.sub(r'[^-a-zA-Z0-9_.]', '_', name)}.mp4")
+        frames, rate = film(model, task, name, seed)
+        imageio.imwrite(path, frames, fps=rate, macro_block_size=2)
+        films.append({"name": name, "data": base64.b64encode(path.read_bytes()).decode()})
+    template = jinja2.Environment(
+        loader=jinja2.PackageLoader("sb3_ddiffpg"), autoescape=True, undefined=jinja2.StrictUndefined
+    ).get_template("report.html")
+    page = template.render(
+        title=title or f"The modes of {source} on {task.id}",
+        subtitle=f"{len(model.modes)} modes after {model.num_timesteps:,} environment steps",
+        rows=_rows(model, found, values),
+        ways_note=_ways_note(found),
+        summary=_summary(found),
+        evaluation=str(found),
+        pictures=[
+            {"name": name, "caption": pictures.CAPTIONS[name], "data": _png(figure)}
+            for name, figure in pictures.draw_all(model, maze, observation, drawn).items()
+        ],
+        videos=films,
+        history=str(model.mode_history),
+        settings=_settings(model),
+        reproduce=_command(source, output.name, task, n_episodes, seed, videos),
+        versions=_versions(),
+    )
+    output.write_text(page, encoding="utf-8")
+    return found
+
+
+def _png(figure: Any) -> str:
+    with io.BytesIO() as file:
+        figure.savefig(file, format="png", dpi=90)
+        return base64.b64encode(file.getvalue()).decode()
+
+
+def _rows(model: DDiffPG, found: ModeEvaluation, values: np.ndarray) -> list[dict[str, Any]]:
+    by_name = {each.mode: each for each in found.commanded}
+    top = max((each.success_rate for each in found.commanded), default=0.0)
+    least = min((each.success_interval[0] for each in found.commanded if each.success_rate == top), default=0.0)
+    good = [each for each in found.commanded if each.n_successes and each.success_rate >= least]
+    best = min(good, key=lambda each: each.mean_length).mode if good else None
+    rows = []
+    for mode, value in zip(model.modes, values, strict=True):
+        result = by_name[mode.name]
+        low, high = result.success_interval
+        rows.append(
+            {
+                "name": mode.name,
+                "color": to_hex(plots.mode_color(mode.number)),
+                "frozen": mode.frozen,
+                "best": mode.name == best,
+                "ways": ", ".join(f"{label} ({count})" for label, count in result.labels.items()) or "none",
+                "success": f"{result.success_rate:.0%}",
+                "interval": f"{low:.0%} to {high:.0%}",
+                "length": "-" if np.isnan(result.mean_length) else f"{result.mean_length:.0f}",
+                "episode_return": f"{result.mean_return:.2f}",
+                "value": f"{value:.2f}",
+                "born_at": f"{mode.born_at:,}",
+            }
+        )
+    return sorted(rows, key=lambda row: not row["best"])
+
+
+def _ways_note(found: ModeEvaluation) -> str:
+    if found.label_source == "clustering":
+        return "The environment does not say which way was taken: ways are clusters of these episodes' own paths."
+    return "Ways are told apart by the environment, not by the clustering that found the modes."
+
+
+def _summary(found: ModeEvaluation) -> list[tuple[str, str]]:
+    def percent(value: float) -> str:
+        return "-" if np.isnan(value) else f"{value:.1%}"
+
+    low, high = found.uncommanded.success_interval
+    return [
+        ("success without command", f"{found.uncommanded.success_rate:.1%} (95 %: {low:.1%} to {high:.1%})"),
+        ("ways expected in 20 episodes without command", f"{found.expected_modes():.2f}"),
+        ("ways taken in at least 5 % of them", str(found.robust_modes)),
+        ("effective number of ways", f"{found.effective_modes:.2f}"),
+        ("share of the task's listed ways", percent(found.coverage)),
+        ("commanded episodes that took their mode's own way", percent(found.control_accuracy)),
+        ("episodes start apart by at most", f"{found.start_spread:.3g}"),
+    ]
+
+
+def _settings(model: DDiffPG) -> list[tuple[str, str]]:
+    """Constructor arguments that differ from their defaults."""
+    settings = []
+    for name, parameter in inspect.signature(DDiffPG.__init__).parameters.items():
+        value = getattr(model, name, None)
+        if name in ("self", "policy", "env", "device", "verbose", "tensorboard_log", "_init_setup_model", "action_noise"):
+            continue
+        if callable(value) or value is None or value == parameter.default or repr(value) == repr(parameter.default):
+            continue
+        shown = f"{value.frequency} {value.unit.value}" if name == "train_freq" else repr(value)
+        if name != "train_freq" or value.frequency != 1:
+            settings.append((name, shown))
+    return settings
+
+
+def _command(source: str, output: str, task: Task, n_episodes: int, seed: int, videos: bool) -> str:
+    kwargs = "".join(f" {name}={json.dumps(value)!r}" for name, value in task.kwargs.items())
+    options = f"--env {task.id}{' --env-kwargs' + kwargs if kwargs else ''} --episodes {n_episodes} --seed {seed}"
+    return f"python -m sb3_ddiffpg.report {source} --output {output} {options}{'' if videos else ' --no-videos'}"
+
+
+def _versions() -> str:
+    known = []
+    for name in _PACKAGES:
+        try:
+            known.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    return ", ".join([*known, f"Python {platform.python_version()}"])
+
+
+def _keyword(text: str) -> tuple[str, Any]:
+    name, separator, value = text.partition("=")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"{text!r} given; accepted is NAME=VALUE")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """
+    :param arguments: Command line; that of the process when None
+    """
+    parser = argparse.ArgumentParser(prog="python -m sb3_ddiffpg.report", description="One page about a trained model.")
+    parser.add_argument("model", type=Path, help="a .zip that was saved by DDiffPG; loading runs code in it: trust its source")
+    parser.add_argument("--output", type=Path, required=True, help="the page, .html")
+    parser.add_argument("--env", help="id of the environment; where the model was trained if left out")
+    parser.add_argument("--env-kwargs", type=_keyword, nargs="+", default=[], metavar="NAME=VALUE", help="values are JSON")
+    parser.add_argument("--replay-buffer", type=Path, help="saved with the model: for the dendrogram, and values of an arm")
+    parser.add_argument("--episodes", type=int, default=100, help="for each mode")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--no-videos", action="store_true")
+    parser.add_argument("--title")
+    given = parser.parse_args(arguments)
+    for path in (given.model, given.replay_buffer):
+        if path is not None and not path.is_file():
+            raise SystemExit(f"{path} does not exist")
+    model = DDiffPG.load(given.model)
+    if given.replay_buffer is not None:
+        model.load_replay_buffer(given.replay_buffer)
+    try:
+        task = Task.of(model, given.env, dict(given.env_kwargs))
+    except ValueError as error:
+        raise SystemExit(str(error)) from error
+    videos = not given.no_videos
+    found = make_report(model, given.output, task, given.episodes, given.seed, videos, given.title, given.model.name)
+    found.save(given.output.with_suffix(".json"))
+    print(f"{found}\n\nwrote {given.output} and {given.output.with_suffix('.json')}")
+
+
+if __name__ == "__main__":
+    main()
