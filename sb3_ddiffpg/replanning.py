@@ -20,7 +20,8 @@ class Replanner:
 
     :param model: A trained model with modes
     :param patience: Steps without movement after which a mode has failed
-    :param tolerance: Distance, in units of the features, that counts as movement. None: the mean step of the modes' own routes
+    :param tolerance: Distance, in units of the features, that counts as movement. None: two mean steps of the modes' own
+        routes, since a stochastic policy trembles where it is stuck
     :param order: In which order modes are tried: names, or ``"return"``, by the discounted return to expect from each in
         training, or ``"value"``, by the critics' opinion at the place where a mode is to be chosen
     :param features: What says where the agent is, see ``ModeFeatures``; the model's mode features when None
@@ -44,7 +45,7 @@ class Replanner:
         self.success_key = model.success_key
         self._resolved_features = model._resolved_features if features is None else features
         self.features = ModeFeatures(model.observation_space, self._resolved_features)
-        self.tolerance = self._mean_step() if tolerance is None else tolerance
+        self.tolerance = 2 * self._mean_step() if tolerance is None else tolerance
         if not self.tolerance > 0:
             raise ValueError(f"tolerance: {self.tolerance} given; accepted are positive numbers")
         self.by_value = order == "value"

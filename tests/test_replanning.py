@@ -95,7 +95,7 @@ def test_like_a_slow_one(moves, patience, order, seed):
 
 def test_begins_with_what_returns_most_and_remembers_what_failed():
     replanner = Replanner(Stub(), patience=2)
-    assert replanner.tolerance == pytest.approx(0.5)  # a step of the routes
+    assert replanner.tolerance == pytest.approx(1.0)  # two steps of the routes
     driven = follow(replanner, np.zeros((14, 1, 2)))[:, 0].tolist()
     assert driven == [1, 1, 2, 2, 0, 0, 1, 1, 2, 2, 0, 0, 1, 1]
     # the same return, sooner

@@ -1,0 +1,56 @@
+"""Visits by cell, against counting by hand."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from environments import TwoEnds, small_model
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.envs import make_vec_env
+from sb3_ddiffpg.visits import VisitMap
+
+
+@given(
+    st.integers(1, 3).flatmap(lambda dim: arrays(float, (20, dim), elements=st.floats(-500, 500))),
+    st.sampled_from([0.05, 1.0, 3.0]),
+)
+def test_like_counting_by_hand(positions, cell_size):
+    visits = VisitMap(positions.shape[1], cell_size)
+    for part in np.array_split(positions, 3):
+        visits.observe(part)
+    expected = Counter(tuple(np.floor(position / cell_size).astype(int).tolist()) for position in positions)
+    centres, counts = visits.cells()
+    cells = np.round(centres / cell_size - 0.5).astype(int)
+    assert dict(zip(map(tuple, cells.tolist()), counts.tolist(), strict=True)) == dict(expected)
+    assert len(visits) == len(expected)
+
+
+def test_a_run_counts_where_it_has_been(tmp_path):
+    model = small_model(DummyVecEnv([TwoEnds] * 4)).learn(400)
+    assert model.visits.cells()[1].sum() == model.num_timesteps
+    steps, known = zip(*model.visits.coverage, strict=True)
+    assert list(steps) == sorted(steps) and list(known) == sorted(known) and known[-1] <= len(model.visits)
+    model.save(tmp_path / "model")
+    loaded = DDiffPG.load(tmp_path / "model")
+    np.testing.assert_array_equal(loaded.visits.cells()[0], model.visits.cells()[0])
+    assert loaded.visits.coverage == model.visits.coverage
+
+
+def test_cells_are_those_of_the_environment():
+    assert small_model(make_vec_env("PointMazeV1-v0", 2)).visits.cell_size == 1.0
+    assert small_model(DummyVecEnv([TwoEnds])).visits.cell_size == 0.5
+    assert small_model("Pendulum-v1", max_modes=2).visits.dim == 3
+    assert small_model("MountainCarContinuous-v0").visits.dim == 2
+
+
+@pytest.mark.parametrize(
+    ("dim", "cell_size", "message"), [(4, 1.0, "dim must be 1 to 3, got 4"), (2, 0.0, "cell_size must be")]
+)
+def test_bad_arguments(dim, cell_size, message):
+    with pytest.raises(ValueError, match=message):
+        VisitMap(dim, cell_size)
