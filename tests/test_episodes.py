@@ -172,4 +172,5 @@ def test_routes_are_drawn_over_the_maze():
     assert [line.get_linestyle() for line in lines] == ["-", "-", "--", "--"]
     assert lines[0].get_color() == lines[1].get_color() != lines[2].get_color()
     np.testing.assert_allclose(lines[0].get_xydata(), episodes["above"][0].path)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["start", "above", "nowhere"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["above", "nowhere"]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["start", "goal"]

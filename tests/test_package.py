@@ -62,7 +62,7 @@ def test_wheel_holds_every_file_of_the_package(wheel):
         built = set(archive.namelist())
     expected = {path.relative_to(ROOT).as_posix() for path in (ROOT / "sb3_ddiffpg").rglob("*.py")}
     expected |= {f"sb3_ddiffpg/zoo_hyperparams/{path.name}" for path in (ROOT / "zoo_hyperparams").iterdir()}
-    expected |= {"sb3_ddiffpg/py.typed"}
+    expected |= {"sb3_ddiffpg/py.typed", "sb3_ddiffpg/templates/report.html"}
     assert {name for name in built if ".dist-info/" not in name} == expected
     assert any(name.endswith("LICENSE") for name in built)
 

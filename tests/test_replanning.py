@@ -94,28 +94,28 @@ def test_like_a_slow_one(moves, patience, order, seed):
 
 
 def test_begins_with_what_returns_most_and_remembers_what_failed():
-    replanner = Replanner(Stub(), patience=2)
+    replanner = Replanner(Stub(), patience=2, order="return")
     assert replanner.tolerance == pytest.approx(1.0)  # two steps of the routes
     driven = follow(replanner, np.zeros((14, 1, 2)))[:, 0].tolist()
     assert driven == [1, 1, 2, 2, 0, 0, 1, 1, 2, 2, 0, 0, 1, 1]
     # the same return, sooner
-    assert Replanner(Stub((1.0, 1.0, 1.0), (9.0, 7.0, 8.0))).ranked.tolist() == [1, 2, 0]
+    assert Replanner(Stub((1.0, 1.0, 1.0), (9.0, 7.0, 8.0)), order="return").ranked.tolist() == [1, 2, 0]
     # a mode that was never commanded is taken by its trajectories' return
     model = Stub()
     model.modes[0].outcomes.clear()
     model.modes[0].mean_return = 2.0
-    assert Replanner(model).ranked.tolist() == [0, 1, 2]
+    assert Replanner(model, order="return").ranked.tolist() == [0, 1, 2]
 
 
 def test_order_by_value():
-    replanner = Replanner(Stub(), patience=2, order="value")
+    replanner = Replanner(Stub(), patience=2)
     positions = np.array([[3.0, 0.0], [-3.0, 0.0]])
     driven = follow(replanner, np.tile(positions, (5, 1, 1)))
     assert driven.T.tolist() == [[0, 0, 2, 2, 1], [1, 1, 2, 2, 0]]
 
 
 def test_one_observation_and_none_of_the_state():
-    replanner = Replanner(Stub(), patience=1)
+    replanner = Replanner(Stub(), patience=1, order="return")
     action, state = replanner.predict(np.zeros(3, dtype=np.float32))
     assert action.shape == (1,) and action[0] == 1
     action, state = replanner.predict(np.zeros(3, dtype=np.float32), state)
@@ -128,7 +128,7 @@ def test_dict_observations_and_normalised_ones(trained):
     model = Stub()
     model.observation_space = spaces.Dict({"camera": image_dict_space()["img"], "at": spaces.Box(-1.0, 1.0, (2,))})
     model._resolved_features = "at"
-    replanner = Replanner(model, patience=1)
+    replanner = Replanner(model, patience=1, order="return")
     one = {key: space.sample() for key, space in model.observation_space.items()}
     action, state = replanner.predict(one)
     assert action[0] == 1 and replanner.predict({key: value[None] for key, value in one.items()}, state)[0].tolist() == [[2]]
@@ -136,12 +136,12 @@ def test_dict_observations_and_normalised_ones(trained):
     scaled = Stub()
     scaled.get_vec_normalize_env = lambda: SimpleNamespace(unnormalize_obs=lambda obs: obs * 100)
     path = np.linspace(0, 0.1, 10)[:, None, None] * np.ones((1, 1, 2))
-    assert set(follow(Replanner(scaled, patience=2), path).ravel()) == {1}
+    assert set(follow(Replanner(scaled, patience=2, order="return"), path).ravel()) == {1}
 
 
 def test_in_use(trained):
     env = DummyVecEnv([TwoEnds] * 3)
-    replanner = Replanner(trained, tolerance=0.05)
+    replanner = Replanner(trained, tolerance=0.05, order="return")
     mean, _ = evaluate_policy(replanner, env, n_eval_episodes=6)
     assert np.isfinite(mean)
     found = evaluate_modes(replanner, env, 3)
