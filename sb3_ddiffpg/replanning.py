@@ -22,8 +22,8 @@ class Replanner:
     :param patience: Steps without movement after which a mode has failed
     :param tolerance: Distance, in units of the features, that counts as movement. None: two mean steps of the modes' own
         routes, since a stochastic policy trembles where it is stuck
-    :param order: In which order modes are tried: ``"value"``, by the return that each mode's critics expect from where the agent
-        is then; ``"return"``, by the discounted return that each had in training; or names
+    :param order: In which order modes are tried: ``"value"``, by the return that each mode's critics expect from where the
+        agent is then; ``"return"``, by the discounted return that each had in training; or names
     :param features: What says where the agent is, see ``ModeFeatures``; the model's mode features when None
     :raises ValueError: If an argument cannot work, naming it
     """
