@@ -140,7 +140,7 @@ class ModeCritics(nn.Module):
         if self.twin_target == "elementwise":
             twins = logits.softmax(dim=-1).unbind(dim=1)
             projections = [project_distribution(twin, self.atoms[kind][:, None, :], rewards, discounts) for twin in twins]
-            return th.stack(projections).amin(dim=0)
+            return th.stack(projections).amin(dim=0).clamp(0.0, 1.0)  # rounding can exceed one
         index = lower_twin[:, None, :, None].expand(-1, 1, -1, self.n_atoms)
         probabilities = logits.gather(1, index).squeeze(1).softmax(dim=-1)  # [G, n, n_atoms]
         return project_distribution(probabilities, self.atoms[kind][:, None, :], rewards, discounts)

@@ -98,6 +98,16 @@ def test_scalar_target_is_the_clipped_minimum():
     th.testing.assert_close(critics.bellman_target(features, actions, rewards, discounts), expected)
 
 
+def test_elementwise_targets_are_probabilities():
+    """At the end of an episode all of a distribution falls on one atom, and sums to a little more than one."""
+    th.manual_seed(0)
+    critics = ModeCritics(3, 2, [16], n_groups=1, n_atoms=51, twin_target="elementwise", exploration_support=(0.0, 5.0))
+    features, actions = th.randn(1, 2000, 3), th.randn(1, 2000, 2)
+    targets = critics.bellman_target(features, actions, th.ones(1, 2000), th.zeros(1, 2000))
+    assert targets.min() >= 0 and targets.max() <= 1
+    assert critics.loss(features, actions, targets).isfinite().all()
+
+
 def test_elementwise_target_by_hand():
     """The authors' code: binary cross-entropy with the minimum of the two projected distributions."""
     th.manual_seed(0)

@@ -1,0 +1,189 @@
+"""
+One update of DDiffPG: its parts, beside SB3's TD3 of the same batch and hidden sizes (small networks), and beside a plain
+implementation of the same arithmetic (the paper's networks). Medians of process CPU time on one thread, all in one run.
+
+Only ratios carry over to another machine. Usage: ``python benchmarks/bench_update.py [--seconds 4] [--batches 256 1024 4096]``
+"""
+
+import argparse
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+import yaml
+from gymnasium import spaces
+from plain_update import PlainUpdate
+from stable_baselines3 import TD3
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch import nn
+
+from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.trajectories import NO_MODE
+from sb3_ddiffpg.zoo import config_file
+
+N_MODES = 2
+PARTS = {
+    "sampling": "sample_modes",
+    "novelty": "_rewards",
+    "critics, denoising in it": "_update_critics",
+    "ascent": "_improve_target_actions",
+    "policy": "_update_actor",
+    "targets": "_update_targets",
+}
+
+
+class Noise(gym.Env[np.ndarray, np.ndarray]):
+    """An environment of random observations whose episodes last 100 steps."""
+
+    def __init__(self, observation_dim: int, action_dim: int) -> None:
+        self.observation_space = spaces.Box(-np.inf, np.inf, (observation_dim,), dtype=np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (action_dim,), dtype=np.float32)
+        self.mode_features = np.array([0, 1])
+        self.steps, self.rng = 0, np.random.default_rng(0)
+
+    def _observe(self) -> np.ndarray:
+        return self.rng.normal(size=self.observation_space.shape).astype(np.float32)
+
+    def reset(self, **_: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        """A new episode."""
+        self.steps = 0
+        return self._observe(), {}
+
+    def step(self, _: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Every other episode reaches a goal."""
+        self.steps += 1
+        done = self.steps == 100
+        return self._observe(), float(done), done, False, {"is_success": done and self.rng.random() < 0.5}
+
+    def close(self) -> None:
+        """Nothing."""
+
+
+def filled(observation_dim: int, action_dim: int, **settings: Any) -> DDiffPG:
+    """
+    :param observation_dim: Size of an observation
+    :param action_dim: Size of an action
+    :param settings: Of the model
+    :return: A model with two modes and 20 000 random transitions
+    """
+    env = DummyVecEnv([lambda: Noise(observation_dim, action_dim)] * 20)
+    model = DDiffPG("DiffusionPolicy", env, **{**settings, "buffer_size": 50_000, "learning_starts": 10**9})
+    model.set_logger(configure(None, []))
+    model.learn(20_000, callback=None, log_interval=10**9)
+    buffer = model.replay_buffer
+    model.policy.inherit([None] * N_MODES, [False] * N_MODES)
+    successes, failures = buffer.trajectories(True), buffer.trajectories(False)
+    labels = [np.arange(len(part)) % N_MODES for part in (successes, failures)]
+    buffer.assign_modes(successes, labels[0], failures, labels[1], [None] * N_MODES)
+    assert all(t.mode != NO_MODE for t in successes[-20:])
+    return model
+
+
+def median_ms(calls: dict[str, Callable[[], Any]], seconds: float) -> dict[str, float]:
+    """
+    :param calls: What to measure, in turns
+    :param seconds: For how long
+    :return: Median milliseconds of CPU by name
+    """
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    end = time.perf_counter() + seconds
+    while time.perf_counter() < end or len(next(iter(times.values()))) < 3:
+        for name, call in calls.items():
+            started = time.process_time()
+            call()
+            times[name].append(time.process_time() - started)
+    return {name: 1e3 * float(np.median(values)) for name, values in times.items()}
+
+
+def parts_ms(model: DDiffPG, batch_size: int, n_updates: int) -> dict[str, float]:
+    """
+    :param model: A filled model
+    :param batch_size: Transitions of an update
+    :param n_updates: How many
+    :return: Median milliseconds of CPU by part
+    """
+    times: dict[str, list[float]] = defaultdict(list)
+
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            started = time.process_time()
+            result = function(*args, **kwargs)
+            times[name].append(time.process_time() - started)
+            return result
+
+        return call
+
+    for name, method in PARTS.items():
+        owner: Any = model.replay_buffer if method == "sample_modes" else model
+        setattr(owner, method, timed(name, getattr(owner, method)))
+    model.train(n_updates, batch_size)
+    for method in PARTS.values():
+        owner = model.replay_buffer if method == "sample_modes" else model
+        delattr(owner, method)
+    return {name: 1e3 * float(np.median(values)) for name, values in times.items()}
+
+
+def small(seconds: float) -> None:
+    """
+    :param seconds: Spent on it
+    """
+    model = filled(4, 2, gamma=0.97, exploration_n_steps=3)
+    env: Any = DummyVecEnv([lambda: Noise(4, 2)] * 20)
+    hidden = dict(net_arch=[128, 128])
+    td3 = TD3("MlpPolicy", env, batch_size=256, learning_starts=10**9, buffer_size=50_000, policy_kwargs=hidden)
+    td3.set_logger(configure(None, []))
+    td3.learn(20_000, log_interval=10**9)
+    found = median_ms({"DDiffPG": lambda: model.train(1, 256), "TD3": lambda: td3.train(1, 256)}, seconds)
+    print("\nsmall networks (128-128), batch 256, 2 modes                ms")
+    for name, value in parts_ms(model, 256, 100).items():
+        print(f"  {name:<48} {value:9.2f}")
+    print(f"  {'a whole update':<48} {found['DDiffPG']:9.2f}")
+    print(f"  {'SB3 TD3, a whole update':<48} {found['TD3']:9.2f}   {found['DDiffPG'] / found['TD3']:.2f}x")
+
+
+def paper(batch_size: int, seconds: float, activation: str) -> None:
+    """
+    :param batch_size: Transitions of an update
+    :param seconds: Spent on it
+    :param activation: Of the policy, "mish" as in the authors' code, or "silu"
+    """
+    path = config_file("ddiffpg")
+    assert path is not None
+    entry = yaml.safe_load(path.read_text())["paper"]
+    drop = {"policy", "n_envs", "n_timesteps", "policy_kwargs", "replay_buffer_kwargs", "learning_starts", "buffer_size"}
+    settings = {name: value for name, value in entry.items() if name not in drop}
+
+    def kwargs(activation_fn: type[nn.Module]) -> dict[str, Any]:
+        sizes = dict(pi=[1024, 512, 256], qf=[512, 256, 128])
+        return dict(net_arch=sizes, activation_fn=activation_fn, critic_activation_fn=nn.ELU, time_embedding_dim=256)
+
+    plain = PlainUpdate(filled(29, 8, **settings, policy_kwargs=kwargs(nn.Mish)))
+    model = filled(29, 8, **settings, policy_kwargs=kwargs(nn.Mish if activation == "mish" else nn.SiLU))
+    calls = {"ours": lambda: model.train(1, batch_size), "plain": lambda: plain(batch_size)}
+    found = median_ms(calls, seconds)
+    label = f"batch {batch_size}, {activation}"
+    print(f"  {label:<24} {found['ours']:9.1f} {found['plain']:9.1f}   {found['plain'] / found['ours']:.2f}x")
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=4.0, help="time spent on each entry")
+    parser.add_argument("--batches", type=int, nargs="*", default=[256, 1024, 4096], help="of the paper's networks")
+    given = parser.parse_args()
+    th.set_num_threads(1)
+    th.set_flush_denormal(True)
+    small(given.seconds)
+    print("\nthe paper's networks, 2 modes, K = 20        ours     plain ms")
+    for batch_size in given.batches:
+        for activation in ("mish", "silu"):
+            paper(batch_size, given.seconds, activation)
+
+
+if __name__ == "__main__":
+    main()
