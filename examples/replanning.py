@@ -1,6 +1,6 @@
 """
-Ways are blocked that were open in training: a DDiffPG trained on the maze V3 (by ``examples/demo.py --env PointMazeV3-v0``) with
-and without replanning, and SB3's TD3 trained on V3 for as many steps, on ``PointMazeRandom-v0``.
+Ways are blocked that were open in training: a DDiffPG trained on the maze V3 (by ``examples/demo.py --env PointMazeV3-v0``)
+with and without replanning, and SB3's TD3 trained on V3 for as many steps, on ``PointMazeRandom-v0``.
 """
 
 import argparse
