@@ -9,11 +9,12 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import Figure
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_ddiffpg.episodes import run_episodes
 from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
 from sb3_ddiffpg.history import ModeEvent
+from sb3_ddiffpg.rng import preserved_rng
 from sb3_ddiffpg.trajectories import read_success
 
 
@@ -120,9 +121,11 @@ class EvaluateModesCallback(BaseCallback):
         self._next = 0
 
     def _init_callback(self) -> None:
-        self._next = self.num_timesteps + self.eval_freq
         if self.path is not None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
+
+    def _on_training_start(self) -> None:
+        self._next = self.model.num_timesteps + self.eval_freq
 
     def _on_step(self) -> bool:
         return True
@@ -133,9 +136,10 @@ class EvaluateModesCallback(BaseCallback):
             self._evaluate()
 
     def _evaluate(self) -> None:
-        if isinstance(self.training_env, VecNormalize):
+        if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
-        found = evaluate_modes(self.model, self.eval_env, self.n_episodes, **self.kwargs)
+        with preserved_rng():
+            found = evaluate_modes(self.model, self.eval_env, self.n_episodes, **self.kwargs)
         self.evaluations.append((self.num_timesteps, found))
         values = {
             "expected_modes": found.expected_modes(),
@@ -174,8 +178,8 @@ class ModeFigureCallback(BaseCallback):
         self.figure_freq, self.eval_env, self.n_episodes = figure_freq, eval_env, n_episodes
         self._next = 0
 
-    def _init_callback(self) -> None:
-        self._next = self.num_timesteps + self.figure_freq
+    def _on_training_start(self) -> None:
+        self._next = self.model.num_timesteps + self.figure_freq
 
     def _on_step(self) -> bool:
         return True
@@ -184,15 +188,20 @@ class ModeFigureCallback(BaseCallback):
         if self.num_timesteps < self._next:
             return
         self._next = self.num_timesteps + self.figure_freq
+        with preserved_rng():
+            figures = self._figures()
+        for name, figure in figures.items():
+            self.logger.record(f"figures/{name}", Figure(figure, close=True), exclude=("stdout", "log", "json", "csv"))
+        self.logger.dump(self.num_timesteps)
+
+    def _figures(self) -> dict[str, Any]:
         episodes = None
         model: Any = self.model
         if self.eval_env is not None and len(model.modes):
-            if isinstance(self.training_env, VecNormalize):
+            if model.get_vec_normalize_env() is not None:
                 sync_envs_normalization(self.training_env, self.eval_env)
             episodes = {name: run_episodes(model, self.eval_env, self.n_episodes, mode=name) for name in model.modes.names}
         maze = self.training_env.get_attr("maze", indices=0)[0] if self.training_env.has_attr("maze") else None
-        observation: Any = model._last_obs
+        observation: Any = model._last_original_obs if model.get_vec_normalize_env() is not None else model._last_obs
         first = None if observation is None or isinstance(observation, dict) else np.asarray(observation)[0]
-        for name, figure in self._draw(model, maze, first, episodes).items():
-            self.logger.record(f"figures/{name}", Figure(figure, close=True), exclude=("stdout", "log", "json", "csv"))
-        self.logger.dump(self.num_timesteps)
+        return self._draw(model, maze, first, episodes)

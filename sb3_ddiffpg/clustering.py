@@ -154,7 +154,9 @@ class Inheritance:
     retired: list[int]
 
 
-def match_modes(old_labels: np.ndarray, new_labels: np.ndarray, n_old: int, n_new: int) -> Inheritance:
+def match_modes(
+    old_labels: np.ndarray, new_labels: np.ndarray, n_old: int, n_new: int, frozen: Sequence[int] = ()
+) -> Inheritance:
     """
     Match new clusters to old modes by the trajectories they share: one to one, such that the matched pairs share as
     many as possible. Among equally good matchings the one that pairs low indices with low indices is taken.
@@ -163,6 +165,7 @@ def match_modes(old_labels: np.ndarray, new_labels: np.ndarray, n_old: int, n_ne
     :param new_labels: cluster of the same trajectories now, shape ``[n]``, from -1 (none) to ``n_new - 1``
     :param n_old: number of old modes
     :param n_new: number of new clusters
+    :param frozen: old modes that come before all others: each is kept if it shares a trajectory with any cluster
     :return: who continues whom; every old mode is kept once, merged or retired
     :raises ValueError: if the labels differ in shape or lie outside their range
     """
@@ -176,6 +179,7 @@ def match_modes(old_labels: np.ndarray, new_labels: np.ndarray, n_old: int, n_ne
     # Small enough in sum never to outweigh one trajectory, and largest for low with low: it decides ties only.
     preference = np.outer(np.arange(n_old, 0, -1), np.arange(n_new, 0, -1))
     weight = overlap * (n_old * n_new * min(n_old, n_new) + 1) + preference * (overlap > 0)
+    weight[list(frozen)] += (overlap[list(frozen)] > 0) * (weight.sum() + 1)
     successor = {
         int(old): int(new)
         for old, new in zip(*linear_sum_assignment(weight, maximize=True), strict=True)

@@ -274,6 +274,8 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         self._modes: list[Mode] = []
         self._next_mode_number = 0
         self.mode_history = ModeHistory()
+        self._steps_before = 0  # of earlier calls of ``learn`` that counted from 0
+        self.is_normalized = False
         self.visits: VisitMap | None = None
         self.env_spec: str | None = None
         self._behavior = Behavior(0)
@@ -325,6 +327,7 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
             self.visits = VisitMap(self.replay_buffer.features.dim, declared_cell_size(self.env))
         if self.env is not None:
             self.env_spec = describe_env(self.env)
+            self.is_normalized = self._vec_normalize_env is not None
         measure = NOVELTY_MEASURES[self.novelty] if isinstance(self.novelty, str) else self.novelty
         self.novelty_model: Any = measure(
             self.replay_buffer.features.dim, self.policy.actor.features_dim, **(self.novelty_kwargs or {})
@@ -629,6 +632,8 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
                 "VecNormalize scales the rewards (norm_reward=True), and so the values, which the critics' support "
                 f"[v_min={self.v_min}, v_max={self.v_max}] must cover; norm_reward=False leaves them in reward units"
             )
+        if reset_num_timesteps:
+            self._steps_before += self.num_timesteps
         new_episodes = reset_num_timesteps or self._last_obs is None
         if new_episodes:
             self.replay_buffer.drop_unfinished_episodes()
@@ -709,7 +714,7 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
     def _expect_unknown_modes(self, n_modes: int) -> None:
         self.policy.resize(n_modes)
         numbers = range(self._next_mode_number, self._next_mode_number + n_modes)
-        self._hold([Mode(number, default_name(number), born_at=self.num_timesteps) for number in numbers])
+        self._hold([Mode(number, default_name(number), born_at=self.lifetime_steps) for number in numbers])
         self.replay_buffer.expect_modes(n_modes)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:

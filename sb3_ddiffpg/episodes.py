@@ -57,6 +57,9 @@ def run_episodes(
     results: list[list[EpisodeResult]] = [[] for _ in range(env.num_envs)]
     # Positions are compared in metres, whatever a normalising wrapper shows the networks
     normalizer = unwrap_vec_normalize(env)
+    was_training = normalizer is not None and normalizer.training
+    if normalizer is not None:
+        normalizer.training = False  # test episodes are not what the statistics are of
     obs, state, starts = env.reset(), None, np.ones(env.num_envs, dtype=bool)
     original = obs if normalizer is None else normalizer.get_original_obs()
     paths: list[list[np.ndarray]] = [[position] for position in features(original)]  # type: ignore[arg-type]
@@ -80,4 +83,6 @@ def run_episodes(
             episode = EpisodeResult(success, len(paths[i]) - 1, float(returns[i]), infos[i].get("mode"), np.stack(paths[i]))
             results[i].append(episode)
             paths[i], returns[i] = [positions[i]], 0.0
+    if normalizer is not None:
+        normalizer.training = was_training
     return [episode for done, wanted in zip(results, share, strict=True) for episode in done[:wanted]]

@@ -5,6 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,19 @@ from scipy.stats import binomtest
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.clustering import cluster
 from sb3_ddiffpg.dtw import dtw_distances, erase_loops, resample_path
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.episodes import EpisodeResult, run_episodes
+from sb3_ddiffpg.rng import preserved_rng
 from sb3_ddiffpg.trajectories import NO_MODE
 
 #: Share of episodes from which on a way counts as one that the model robustly takes
 ROBUST_SHARE = 0.05
 _FORMAT = 1
+# Of a success that is like no other
+_NO_WAY = ""
 
 
 @dataclass(frozen=True)
@@ -292,11 +297,20 @@ def evaluate_modes(
     :raises ValueError: If an argument cannot work, naming it
     """
     known = [mode.name for mode in getattr(model, "modes", ())]
+    n_uncommanded = 2 * n_episodes if n_uncommanded is None else n_uncommanded
+    for argument, number in (("n_episodes", n_episodes), ("n_uncommanded", n_uncommanded)):
+        if not isinstance(number, (int, np.integer)) or number < 1:
+            raise ValueError(f"{argument} must be an integer of at least 1, got {number!r}")
+    if isinstance(modes, str):
+        raise ValueError(f"modes: {modes!r} given; accepted is a list of names")
     for name in modes or ():
         if name not in known:
             raise ValueError(f"modes: {name!r} given; the model's modes are {known}")
     if isinstance(env, str):
-        if str(gym.spec(env).entry_point).startswith("sb3_ddiffpg."):
+        module, _, name = env.rpartition(":")
+        if module:
+            import_module(module)
+        if str(gym.spec(name).entry_point).startswith("sb3_ddiffpg."):
             env_kwargs = {"start_noise": 0.0, **env_kwargs}
         made = make_vec_env(env, min(n_episodes, 25), seed=seed, **env_kwargs)
         try:
@@ -306,14 +320,16 @@ def evaluate_modes(
     if env_kwargs:
         raise ValueError(f"{sorted(env_kwargs)} given; accepted beside an env that is made already are none")
     if seed is not None:
-        set_random_seed(seed)
-        if hasattr(env, "seed"):
-            env.seed(seed)
+        with preserved_rng():
+            set_random_seed(seed)
+            if hasattr(env, "seed"):
+                env.seed(seed)
+            return evaluate_modes(model, env, n_episodes, n_uncommanded, modes, listed, deterministic)
     commands: list[str | None] = [*(known if modes is None else modes), None]
     runs = [
         run_episodes(model, env, n, mode=command, deterministic=deterministic)
         for command in commands
-        for n in [n_episodes if command is not None else n_uncommanded or 2 * n_episodes]
+        for n in [n_uncommanded if command is None else n_episodes]
     ]
     if listed is None:
         listed = env.get_attr("listed_modes", indices=0)[0] if env.has_attr("listed_modes") else ()
@@ -324,7 +340,7 @@ def evaluate_modes(
     return ModeEvaluation(
         env_id=type(env).__name__ if spec is None else spec.id,
         label_source=source,
-        listed=tuple(listed),
+        listed=tuple(map(str, listed)),
         start_spread=float(np.linalg.norm(np.ptp(starts, axis=0))),
         uncommanded=results[-1],
         commanded=tuple(results[:-1]),
@@ -354,14 +370,20 @@ def _labels(model: Any, runs: list[list[EpisodeResult]]) -> tuple[list[list[str 
     successes = [episode for run in runs for episode in run if _reached(episode)]
     if not successes or any(episode.label is not None for episode in successes):
         return [[str(episode.label) if _reached(episode) else None for episode in run] for run in runs], "environment"
-    # As the model finds them, where it does; but paths of a whole observation have components of different scale
-    paths = [episode.path for episode in successes]
-    if paths[0].shape[1] > 3:
-        scale = np.maximum(np.concatenate(paths).std(axis=0), 1e-6)
-        paths = [path / scale for path in paths]
-    paths = [erase_loops(path, 0.05 * float(np.linalg.norm(np.ptp(path, axis=0)))) for path in paths]
-    distances = dtw_distances([resample_path(path, 48) for path in paths])
-    numbers = iter(cluster(distances, getattr(model, "distance_threshold", None), min_size=1 if len(paths) < 3 else 3))
+    # As the model finds them, where it does
+    buffer = getattr(model, "replay_buffer", None)
+    if isinstance(buffer, ModeReplayBuffer) and (buffer.size() or not buffer.features.whole_observation):
+        paths = [buffer.resample(episode.path) for episode in successes]
+        normalize, linkage = buffer.normalize_distances, model.linkage
+    else:
+        full = [episode.path for episode in successes]
+        if full[0].shape[1] > 3:  # a whole observation, whose components have scales of their own
+            scale = np.maximum(np.concatenate(full).std(axis=0), 1e-6)
+            full = [path / scale for path in full]
+        short = [erase_loops(path, 0.05 * float(np.linalg.norm(np.ptp(path, axis=0)))) for path in full]
+        paths, normalize, linkage = [resample_path(path, 48) for path in short], True, "average"
+    threshold, min_size = getattr(model, "distance_threshold", None), 1 if len(paths) < 3 else 3
+    numbers = iter(cluster(dtw_distances(paths, normalize=normalize), threshold, linkage, min_size=min_size))
     names = [[_cluster_name(next(numbers)) if _reached(episode) else None for episode in run] for run in runs]
     return names, "clustering"
 
@@ -372,7 +394,7 @@ def _reached(episode: EpisodeResult) -> bool:
 
 
 def _cluster_name(number: int) -> str:
-    return f"cluster {number}" if number >= 0 else "other"
+    return f"cluster {number}" if number >= 0 else _NO_WAY
 
 
 def _count(command: str | None, run: list[EpisodeResult], labels: list[str | None]) -> CommandResult:
@@ -383,7 +405,7 @@ def _count(command: str | None, run: list[EpisodeResult], labels: list[str | Non
         n_successes=len(lengths),
         mean_length=float(np.mean(lengths)) if lengths else float("nan"),
         mean_return=float(np.mean([episode.episode_return for episode in run])),
-        labels=dict(Counter(label for label in labels if label is not None).most_common()),
+        labels=dict(Counter(label for label in labels if label).most_common()),
     )
 
 
@@ -392,7 +414,7 @@ def _ways(runs: list[list[EpisodeResult]], labels: list[list[str | None]]) -> tu
     by_label: dict[str, list[EpisodeResult]] = {}
     for run, names in zip(runs, labels, strict=True):
         for episode, name in zip(run, names, strict=True):
-            if name is not None:
+            if name:
                 by_label.setdefault(name, []).append(episode)
     ways = []
     for label, episodes in sorted(by_label.items(), key=lambda item: -len(item[1])):

@@ -18,8 +18,8 @@ from sb3_ddiffpg.reclustering import Reclustering, find_modes
 from sb3_ddiffpg.trajectories import NO_MODE
 from sb3_ddiffpg.visits import VisitMap
 
-# A name stands in tables, tags of a log and on command lines, where a number would be an index
-_NAME = re.compile(r"(?=.*[^\W\d])[\w .+-]{1,40}")
+# A name stands in tables, legends, on command lines (where a number would be an index) and in tags of a log that cuts them
+_NAME = re.compile(r"(?!_)(?=.*[^\W\d])[\w .+-]{1,24}")
 
 
 class ModeControl:
@@ -32,6 +32,7 @@ class ModeControl:
     replay_buffer: ModeReplayBuffer
     logger: Logger
     num_timesteps: int
+    _steps_before: int
     mode_history: ModeHistory
     visits: VisitMap | None
     min_mode_size: int
@@ -53,6 +54,11 @@ class ModeControl:
         for mode, embedding in zip(self._modes, embeddings, strict=True):
             mode.embedding = embedding
         return ModeTable(self._modes)
+
+    @property
+    def lifetime_steps(self) -> int:
+        """Environment steps since the beginning; ``num_timesteps`` starts anew in a ``learn`` that is not told otherwise."""
+        return self._steps_before + self.num_timesteps
 
     # ------------------------------------------------------------------ finding
 
@@ -78,9 +84,9 @@ class ModeControl:
             )
             events = self._replace_modes(found)
             found.describe(self._modes, self.replay_buffer)
-            self.mode_history.note(self.num_timesteps, self._modes)
+            self.mode_history.note(self.lifetime_steps, self._modes)
             if self.visits is not None:
-                self.visits.note(self.num_timesteps)
+                self.visits.note(self.lifetime_steps)
         self.logger.record("modes/n_modes", len(self._modes))
         for mode in self._modes:
             self.logger.record(f"modes/{mode.name}/n_trajectories", mode.n_trajectories)
@@ -103,7 +109,7 @@ class ModeControl:
             found.successes, found.labels, found.failures, found.failure_labels, parents, found.abandoned
         )
         self.policy.inherit(parents, kept, self.reset_new_critics)
-        modes, events = succeed(self._modes, found.inheritance, self.num_timesteps, self._next_mode_number)
+        modes, events = succeed(self._modes, found.inheritance, self.lifetime_steps, self._next_mode_number)
         self._hold(modes)
         self.mode_history.events += events
         return events
@@ -123,13 +129,13 @@ class ModeControl:
         Give a mode a name that says what it does. It keeps it through re-clusterings, saving and resuming.
 
         :param mode: Name, index or record of the mode
-        :param name: Letters, digits, spaces and ``_.+-``, up to 40 of them, not digits alone
+        :param name: Letters, digits, spaces and ``_.+-``, up to 24 of them, not digits alone and without ``_`` in front
         :raises ValueError: If there is no such mode, or another has that name or may be born with it
         """
         record = self._modes[ModeTable(self._modes).index(mode)]
         if not isinstance(name, str) or not _NAME.fullmatch(name) or name != name.strip():
             raise ValueError(
-                f"name={name!r} is no name of a mode: accepted are 1 to 40 letters, digits, spaces and _.+-, not digits alone"
+                f"name={name!r} is no name of a mode: accepted are 1 to 24 letters, digits, spaces and _.+-, not digits alone"
             )
         if any(name == other.name for other in self._modes if other is not record):
             raise ValueError(f"name={name!r} is another mode's; the modes are {ModeTable(self._modes).names}")
@@ -175,7 +181,7 @@ class ModeControl:
             self._hold([self._modes[each] for each in stay])
 
     def _note(self, kind: str, mode: Mode, other: str | None = None) -> None:
-        self.mode_history.events.append(ModeEvent(self.num_timesteps, kind, mode.number, mode.name, other))
+        self.mode_history.events.append(ModeEvent(self.lifetime_steps, kind, mode.number, mode.name, other))
 
     # ------------------------------------------------------------------ choosing
 

@@ -25,12 +25,14 @@ def draw_all(
     maze: Any = None,
     observation: np.ndarray | None = None,
     episodes: Mapping[str, Sequence[EpisodeResult]] | None = None,
+    normalizer: Any = None,
 ) -> dict[str, Figure]:
     """
     :param model: A DDiffPG
     :param maze: The ``envs.Maze`` of its environment, None if it is none
-    :param observation: One observation, whose components that are no position stand for all places of a maze
+    :param observation: One observation, not normalised, whose components that are no position stand for all places of a maze
     :param episodes: Episodes by commanded mode
+    :param normalizer: See ``plots.plot_values``
     :return: Figures by name, see ``CAPTIONS``
     """
     modes = list(model.modes)
@@ -39,10 +41,10 @@ def draw_all(
     if episodes:
         figures["routes"] = plots.plot_routes(episodes, maze, plots.colors_of(modes))
     figures["success"] = plots.plot_success(model.mode_history, names)
-    figures["timeline"] = plots.plot_timeline(model.mode_history, model.num_timesteps)
+    figures["timeline"] = plots.plot_timeline(model.mode_history, model.lifetime_steps)
     places = _places(model, maze, observation)
     if modes and places is not None:
-        figures["values"] = plots.plot_values(model, places, maze)
+        figures["values"] = plots.plot_values(model, places, maze, normalizer)
     if model.visits is not None:
         figures["exploration"] = plots.plot_exploration(model.visits, maze)
     if model.replay_buffer is not None and model.replay_buffer.size():

@@ -63,6 +63,11 @@ def _draw_maze(axes: Any, maze: Any) -> None:
         axes.annotate("goal", goal, ha="center", va="center", fontsize=8)
 
 
+def _in_plane(positions: np.ndarray) -> np.ndarray:
+    """The first two coordinates; of one, the second is zero. [N, dim] -> [N, 2]"""
+    return positions[:, :2] if positions.shape[1] > 1 else np.concatenate((positions, np.zeros_like(positions)), axis=1)
+
+
 def _label_axes(axes: Any, names: Sequence[str] = ("x [m]", "y [m]")) -> None:
     axes.set_aspect("equal")
     axes.set_xlabel(names[0])
@@ -152,9 +157,10 @@ def plot_exploration(visits: VisitMap | None, maze: Any = None) -> Figure:
     if visits is None or not len(visits):
         return _empty("no visit was counted")
     centres, counts = visits.cells()
-    if visits.dim == 1:
-        centres = np.concatenate((centres, np.zeros_like(centres)), axis=1)
-    columns = np.round(centres[:, :2] / visits.cell_size - 0.5).astype(int)
+    columns = np.round(_in_plane(centres) / visits.cell_size - 0.5).astype(int)
+    coarse = int(np.ptp(columns, axis=0).max()) // 1000 + 1  # a stray far away must not make a picture of a million cells
+    columns //= coarse
+    edge = coarse * visits.cell_size
     low = columns.min(axis=0)
     density = np.zeros(columns.max(axis=0) - low + 1)
     np.add.at(density, tuple((columns - low).T), counts)
@@ -163,7 +169,7 @@ def plot_exploration(visits: VisitMap | None, maze: Any = None) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     if maze is not None:
         _draw_maze(left, maze)
-    edges = low * visits.cell_size, (columns.max(axis=0) + 1) * visits.cell_size
+    edges = low * edge, (columns.max(axis=0) + 1) * edge
     extent = (edges[0][0], edges[1][0], edges[0][1], edges[1][1])
     image = left.imshow(
         shown.T, origin="lower", extent=extent, norm=LogNorm(1, MAX_DENSITY), cmap="viridis", alpha=0.85, zorder=0.5
@@ -178,22 +184,25 @@ def plot_exploration(visits: VisitMap | None, maze: Any = None) -> Figure:
     return figure
 
 
-def plot_values(model: Any, observations: np.ndarray, maze: Any = None) -> Figure:
+def plot_values(model: Any, observations: np.ndarray, maze: Any = None, normalizer: Any = None) -> Figure:
     """
     What each mode's critics expect from where: :meth:`DDiffPG.mode_values` at the given observations, over the first two mode
     features. The mode's own route (its medoid) is drawn on top.
 
     :param model: A DDiffPG with modes
-    :param observations: Shape [N, *observation shape], such as :func:`grid_observations` makes
+    :param observations: Not normalised, shape [N, *observation shape], such as :func:`grid_observations` makes
     :param maze: An ``envs.Maze`` that is drawn below
+    :param normalizer: The ``VecNormalize`` with which the model was trained; that of its environment when None
     :return: The figure
     """
     modes = list(model.modes)
     if not modes:
         return _empty("no mode yet")
     parts = np.array_split(observations, max(1, len(observations) // 500))
-    values = np.concatenate([model.mode_values(part) for part in parts])
-    positions = model.replay_buffer.features(observations)
+    normalizer = model.get_vec_normalize_env() if normalizer is None else normalizer
+    shown = parts if normalizer is None else [normalizer.normalize_obs(part) for part in parts]
+    values = np.concatenate([model.mode_values(part) for part in shown])
+    positions = _in_plane(model.replay_buffer.features(observations))
     n_columns = min(3, len(modes))
     n_rows = -(-len(modes) // n_columns)
     figure = _new(4.2 * n_columns, 3.8 * n_rows)
@@ -207,10 +216,11 @@ def plot_values(model: Any, observations: np.ndarray, maze: Any = None) -> Figur
             continue
         if maze is not None:
             _draw_maze(axes, maze)
-        image = axes.scatter(*positions[:, :2].T, c=values[:, index], s=size, marker="s", vmin=low, vmax=high, zorder=0.5)
+        image = axes.scatter(*positions.T, c=values[:, index], s=size, marker="s", vmin=low, vmax=high, zorder=0.5)
         if len(modes[index].representative):
-            axes.plot(*modes[index].representative[:, :2].T, color="w", lw=2.5, zorder=2)
-            axes.plot(*modes[index].representative[:, :2].T, color=mode_color(modes[index].number), lw=1.5, zorder=2)
+            route = _in_plane(modes[index].representative)
+            axes.plot(*route.T, color="w", lw=2.5, zorder=2)
+            axes.plot(*route.T, color=mode_color(modes[index].number), lw=1.5, zorder=2)
         axes.set_title(modes[index].name)
         _label_axes(axes)
     figure.colorbar(image, ax=grid.tolist(), label="value of the mode (discounted, scaled reward)")

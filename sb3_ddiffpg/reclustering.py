@@ -91,8 +91,8 @@ def find_modes(
     returns = np.array([trajectory.episode_return for trajectory in successes])
     labels = _worth_keeping(modes, returns, old_labels, labels, min_return_ratio, max_modes)
     if modes and not births:
-        labels = _without_births(old_labels, labels, len(modes))
-    inheritance = _with_dormant(match_modes(old_labels, labels, len(modes), _count(labels)), modes, dormant, max_modes)
+        labels = _without_births(modes, old_labels, labels)
+    inheritance = _with_dormant(_match(modes, old_labels, labels), modes, dormant, max_modes)
 
     for mode in modes:
         mode.misses, mode.unjudged = mode.misses + mode.unjudged, 0
@@ -107,6 +107,12 @@ def find_modes(
 
 def _count(labels: np.ndarray) -> int:
     return int(labels.max(initial=NO_MODE)) + 1
+
+
+def _match(modes: Sequence[Mode], old_labels: np.ndarray, labels: np.ndarray) -> Inheritance:
+    """Who continues whom, when each frozen mode has a cluster."""
+    frozen = [index for index, mode in enumerate(modes) if mode.frozen]
+    return match_modes(old_labels, labels, len(modes), _count(labels), frozen)
 
 
 def _told(told: dict[int, int], trajectory: Trajectory) -> int:
@@ -177,7 +183,7 @@ def _worth_keeping(
     max_modes: int,
 ) -> np.ndarray:
     """Labels without the clusters that return too little, nor the smallest of too many. Frozen modes stay."""
-    kept = match_modes(old_labels, labels, len(modes), _count(labels))
+    kept = _match(modes, old_labels, labels)
     frozen = [new for new, old in enumerate(kept.parents) if old is not None and kept.kept[new] and modes[old].frozen]
     others = [new for new in range(_count(labels)) if new not in frozen]
     mean = {new: returns[labels == new].mean() for new in [*frozen, *others]}
@@ -206,12 +212,12 @@ def _given_up(modes: Sequence[Mode], trials: int) -> list[int]:
     return missing if len(missing) < len(modes) else []
 
 
-def _without_births(old_labels: np.ndarray, labels: np.ndarray, n_old: int) -> np.ndarray:
+def _without_births(modes: Sequence[Mode], old_labels: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """
     Labels without clusters that continue no mode: a part of a mode goes back to it, the rest are outliers. A mode that is
     born when exploration is over would have too little time to learn.
     """
-    inheritance = match_modes(old_labels, labels, n_old, _count(labels))
+    inheritance = _match(modes, old_labels, labels)
     heirs = {parent: new for new, parent in enumerate(inheritance.parents) if inheritance.kept[new]}
     goes_to = np.array([heirs.get(parent, NO_MODE) for parent in inheritance.parents] + [NO_MODE])  # the last for NO_MODE
     labels = goes_to[labels]

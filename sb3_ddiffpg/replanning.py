@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.utils import is_vectorized_observation
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.features import ModeFeatures
@@ -24,6 +25,7 @@ class Replanner:
         routes, since a stochastic policy trembles where it is stuck
     :param order: In which order modes are tried: ``"value"``, by the return that each mode's critics expect from where the
         agent is then; ``"return"``, by the discounted return that each had in training; or names
+    :param normalizer: Statistics by which the observations are normalised; those of the model's environment when None
     :param features: What says where the agent is, see ``ModeFeatures``; the model's mode features when None
     :raises ValueError: If an argument cannot work, naming it
     """
@@ -35,11 +37,17 @@ class Replanner:
         tolerance: float | None = None,
         order: str | Sequence[str] = "value",
         features: Any = None,
+        normalizer: VecNormalize | None = None,
     ) -> None:
         if not len(getattr(model, "modes", ())):
             raise ValueError(f"model: a {type(model).__name__} without modes given; there is nothing to switch to")
         if patience < 1:
             raise ValueError(f"patience: {patience} given; accepted are whole numbers from 1 up")
+        self.normalizer = model.get_vec_normalize_env() if normalizer is None else normalizer
+        if self.normalizer is None and model.is_normalized:
+            raise ValueError(
+                "normalizer: None given, but the model was trained on normalised observations and has no environment"
+            )
         self.model = model
         self.patience = patience
         self.success_key = model.success_key
@@ -56,6 +64,7 @@ class Replanner:
             raise ValueError(f"order: {order!r} given; it must name modes, none of them twice")
         #: Indices of the modes in use, the one to begin with first
         self.ranked = np.array(ranked)
+        self._numbers = [mode.number for mode in model.modes]
 
     def _mean_step(self) -> float:
         routes = [mode.representative for mode in self.model.modes if len(mode.representative) > 1]
@@ -64,11 +73,10 @@ class Replanner:
         return float(np.mean(np.concatenate([np.linalg.norm(np.diff(route, axis=0), axis=1) for route in routes])))
 
     def _by_return(self) -> list[int]:
-        gamma = self.model.gamma
-        expected = [
-            np.nan_to_num(mode.expected_return, nan=mode.mean_return) * gamma ** np.nan_to_num(mode.mean_length)
-            for mode in self.model.modes
-        ]
+        modes = list(self.model.modes)
+        expected = np.array([np.nan_to_num(mode.expected_return, nan=mode.mean_return) for mode in modes])
+        if (expected >= 0).all():  # else a longer way has already cost more
+            expected = expected * self.model.gamma ** np.nan_to_num([mode.mean_length for mode in modes])
         return [int(index) for index in np.argsort(-np.nan_to_num(expected, nan=-np.inf), kind="stable")]
 
     def predict(
@@ -86,6 +94,8 @@ class Replanner:
         :param deterministic: Passed to the model
         :return: The actions and the state for the next call
         """
+        if [mode.number for mode in self.model.modes] != self._numbers:
+            raise RuntimeError("The model's modes are others since this Replanner was made: make another")
         batch, is_single = self._as_batch(observation)
         positions = self._positions(batch)
         n = len(positions)
@@ -134,5 +144,4 @@ class Replanner:
         return np.tile(-np.arange(len(self.ranked), dtype=float), (n, 1))
 
     def _positions(self, batch: Any) -> np.ndarray:
-        normalizer = self.model.get_vec_normalize_env()
-        return self.features(batch if normalizer is None else normalizer.unnormalize_obs(batch))
+        return self.features(batch if self.normalizer is None else self.normalizer.unnormalize_obs(batch))

@@ -10,7 +10,8 @@ import io
 import json
 import platform
 import re
-from dataclasses import dataclass
+import shlex
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import jinja2
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from matplotlib.colors import to_hex
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_ddiffpg import pictures, plots
 from sb3_ddiffpg.ddiffpg import DDiffPG
@@ -40,10 +41,12 @@ class Task:
 
     :param id: Of the environment
     :param kwargs: Arguments of ``gym.make``
+    :param statistics: A ``VecNormalize`` that was saved, if the model was trained on normalised observations
     """
 
     id: str
     kwargs: dict[str, Any]
+    statistics: Path | None = None
 
     @staticmethod
     def of(model: DDiffPG, env_id: str | None = None, env_kwargs: dict[str, Any] | None = None) -> "Task":
@@ -67,13 +70,38 @@ class Task:
             kwargs["start_noise"] = 0.0
         return Task(env_id, {**kwargs, **(env_kwargs or {})})
 
-    def make(self, n_envs: int, seed: int) -> VecEnv:
+    def make(self, n_envs: int, seed: int, **kwargs: Any) -> VecEnv:
         """
         :param n_envs: Number of environments
         :param seed: Of the first
+        :param kwargs: Further arguments of ``gym.make``
         :return: The environments
         """
-        return make_vec_env(self.id, n_envs, seed=seed, **self.kwargs)
+        env = make_vec_env(self.id, n_envs, seed=seed, **{**self.kwargs, **kwargs})
+        if self.statistics is None:
+            return env
+        normalizer = VecNormalize.load(str(self.statistics), env)
+        normalizer.training = normalizer.norm_reward = False
+        return normalizer
+
+    def check(self, model: DDiffPG) -> None:
+        """
+        :param model: That is to be shown in it
+        :raises ValueError: If it cannot be
+        """
+        if model.is_normalized and self.statistics is None:
+            raise ValueError("--vec-normalize: not given, but the model was trained on normalised observations")
+        try:
+            env = self.make(1, 0)
+        except (gym.error.Error, TypeError, ValueError) as error:
+            raise ValueError(f"--env: {self.id} cannot be made with {self.kwargs}: {error}") from error
+        ours, theirs = (model.observation_space, model.action_space), (env.observation_space, env.action_space)
+        env.close()
+        if ours != theirs:
+            raise ValueError(
+                f"--env: {self.id} has observations and actions {theirs}, the model was trained on {ours}; a wrapper "
+                "that changes them must be part of a registered environment"
+            )
 
 
 def film(model: DDiffPG, task: Task, mode: str | None, seed: int, max_frames: int = 400) -> tuple[np.ndarray, int]:
@@ -88,17 +116,19 @@ def film(model: DDiffPG, task: Task, mode: str | None, seed: int, max_frames: in
     :return: Frames, shape [T, height, width, 3], and frames in a second
     :raises ValueError: If the environment draws no pictures
     """
-    env = gym.make(task.id, render_mode="rgb_array", **task.kwargs)
-    observation, _ = env.reset(seed=seed)
-    frames, done = [env.render()], False
-    while not done and len(frames) < max_frames:
+    env = task.make(1, seed, render_mode="rgb_array")
+    observation: Any = env.reset()
+    frames, done = [env.get_images()[0]], False
+    while not done and len(frames) < max_frames and isinstance(frames[0], np.ndarray):
         action, _ = model.predict(observation, mode=mode)
-        observation, _, terminated, truncated, _ = env.step(action)
-        frames.append(env.render())
-        done = terminated or truncated
-    rate = int(env.metadata.get("render_fps", 20))
+        observation, _, dones, _ = env.step(action)
+        done = bool(dones[0])
+        if not done:  # then the next episode has begun
+            frames.append(env.get_images()[0])
+    metadata: Any = getattr(env, "metadata", None) or {}
+    rate = int(metadata.get("render_fps", 20))
     env.close()
-    if not isinstance(frames[0], np.ndarray):
+    if not isinstance(frames[0], np.ndarray) or frames[0].ndim != 3:
         raise ValueError(f"{task.id} gives no picture of shape [height, width, 3]")
     height, width = (size - size % 2 for size in frames[0].shape[:2])  # what the codec wants
     return np.stack(frames)[:, :height, :width], rate  # type: ignore[arg-type]
@@ -112,7 +142,7 @@ def make_report(
     seed: int = 0,
     videos: bool = True,
     title: str | None = None,
-    source: str = "MODEL.zip",
+    command: str = "",
 ) -> ModeEvaluation:
     """
     Evaluate a model, draw it, and write a page of HTML that needs no other file and no network. Videos lie beside it too.
@@ -124,7 +154,7 @@ def make_report(
     :param seed: Of the evaluation
     :param videos: Whether to film an episode of each mode
     :param title: Of the page
-    :param source: Name of the model's file, for the command that makes this page
+    :param command: The command that makes this page
     :return: The evaluation
     """
     output = Path(output)
@@ -133,21 +163,18 @@ def make_report(
     found = evaluate_modes(model, env, n_episodes, seed=seed)
     first: Any = env.reset()
     maze = env.get_attr("maze", indices=0)[0] if env.has_attr("maze") else None
-    env.close()
-    observation = None if isinstance(first, dict) else first[0]
+    normalizer = unwrap_vec_normalize(env)
+    original: Any = first if normalizer is None else normalizer.get_original_obs()
+    observation = None if isinstance(original, dict) else original[0]
     drawn = {name: runs[:_ROUTES_DRAWN] for name, runs in found.episodes.items() if name != "(none)"}
     values = model.mode_values(first)[0] if len(model.modes) else np.zeros(0)
-    films = []
-    for name in model.modes.names if videos else ():
-        path = output.with_name(f"{output.stem}-{re.sub(r'[^-a-zA-Z0-9_.]', '_', name)}.mp4")
-        frames, rate = film(model, task, name, seed)
-        imageio.imwrite(path, frames, fps=rate, macro_block_size=2)
-        films.append({"name": name, "data": base64.b64encode(path.read_bytes()).decode()})
+    env.close()
+    films, no_films = _films(model, task, seed, output) if videos else ([], "")
     template = jinja2.Environment(
         loader=jinja2.PackageLoader("sb3_ddiffpg"), autoescape=True, undefined=jinja2.StrictUndefined
     ).get_template("report.html")
     page = template.render(
-        title=title or f"The modes of {source} on {task.id}",
+        title=title or f"Ways to solve {task.id}",
         subtitle=f"{len(model.modes)} modes after {model.num_timesteps:,} environment steps",
         rows=_rows(model, found, values),
         ways_note=_ways_note(found),
@@ -155,16 +182,31 @@ def make_report(
         evaluation=str(found),
         pictures=[
             {"name": name, "caption": pictures.CAPTIONS[name], "data": _png(figure)}
-            for name, figure in pictures.draw_all(model, maze, observation, drawn).items()
+            for name, figure in pictures.draw_all(model, maze, observation, drawn, normalizer).items()
         ],
         videos=films,
+        no_films=no_films,
         history=str(model.mode_history),
         settings=_settings(model),
-        reproduce=_command(source, output.name, task, n_episodes, seed, videos),
+        reproduce=command,
         versions=_versions(),
     )
     output.write_text(page, encoding="utf-8")
     return found
+
+
+def _films(model: DDiffPG, task: Task, seed: int, output: Path) -> tuple[list[dict[str, str]], str]:
+    """A film of each mode, beside the page and for it; or why there is none."""
+    films = []
+    for index, name in enumerate(model.modes.names):
+        path = output.with_name(f"{output.stem}-{index}-{re.sub(r'[^-a-zA-Z0-9_.]', '_', name)}.mp4")
+        try:
+            frames, rate = film(model, task, name, seed)
+        except Exception as error:  # whatever an environment's drawing raises: a page without films is better than none
+            return [], f"No film could be made: {error}"
+        imageio.imwrite(path, frames, fps=rate, macro_block_size=2)
+        films.append({"name": name, "data": base64.b64encode(path.read_bytes()).decode()})
+    return films, ""
 
 
 def _png(figure: Any) -> str:
@@ -178,7 +220,7 @@ def _rows(model: DDiffPG, found: ModeEvaluation, values: np.ndarray) -> list[dic
     top = max((each.success_rate for each in found.commanded), default=0.0)
     least = min((each.success_interval[0] for each in found.commanded if each.success_rate == top), default=0.0)
     good = [each for each in found.commanded if each.n_successes and each.success_rate >= least]
-    best = min(good, key=lambda each: each.mean_length).mode if good else None
+    best = min(good, key=lambda each: (-round(each.mean_return, 1), each.mean_length)).mode if good else None
     rows = []
     for mode, value in zip(model.modes, values, strict=True):
         result = by_name[mode.name]
@@ -230,7 +272,7 @@ def _settings(model: DDiffPG) -> list[tuple[str, str]]:
         value = getattr(model, name, None)
         if name in ("self", "policy", "env", "device", "verbose", "tensorboard_log", "_init_setup_model", "action_noise"):
             continue
-        if callable(value) or value is None or value == parameter.default or repr(value) == repr(parameter.default):
+        if callable(value) or value is None or repr(value) == repr(parameter.default):
             continue
         shown = f"{value.frequency} {value.unit.value}" if name == "train_freq" else repr(value)
         if name != "train_freq" or value.frequency != 1:
@@ -238,10 +280,18 @@ def _settings(model: DDiffPG) -> list[tuple[str, str]]:
     return settings
 
 
-def _command(source: str, output: str, task: Task, n_episodes: int, seed: int, videos: bool) -> str:
-    kwargs = "".join(f" {name}={json.dumps(value)!r}" for name, value in task.kwargs.items())
-    options = f"--env {task.id}{' --env-kwargs' + kwargs if kwargs else ''} --episodes {n_episodes} --seed {seed}"
-    return f"python -m sb3_ddiffpg.report {source} --output {output} {options}{'' if videos else ' --no-videos'}"
+def _command(given: argparse.Namespace, task: Task) -> str:
+    words = ["python", "-m", "sb3_ddiffpg.report", str(given.model), "--output", str(given.output), "--env", task.id]
+    if task.kwargs:
+        words += ["--env-kwargs", *(f"{name}={json.dumps(value)}" for name, value in task.kwargs.items())]
+    for option, value in (
+        ("--replay-buffer", given.replay_buffer),
+        ("--vec-normalize", given.vec_normalize),
+        ("--title", given.title),
+    ):
+        words += [] if value is None else [option, str(value)]
+    words += ["--episodes", str(given.episodes), "--seed", str(given.seed), *(["--no-videos"] if given.no_videos else [])]
+    return shlex.join(words)
 
 
 def _versions() -> str:
@@ -274,23 +324,33 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--env", help="id of the environment; where the model was trained if left out")
     parser.add_argument("--env-kwargs", type=_keyword, nargs="+", default=[], metavar="NAME=VALUE", help="values are JSON")
     parser.add_argument("--replay-buffer", type=Path, help="saved with the model: for the dendrogram, and values of an arm")
+    parser.add_argument(
+        "--vec-normalize", type=Path, help="statistics that VecNormalize saved, if observations are normalised"
+    )
     parser.add_argument("--episodes", type=int, default=100, help="for each mode")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--no-videos", action="store_true")
     parser.add_argument("--title")
     given = parser.parse_args(arguments)
-    for path in (given.model, given.replay_buffer):
+    for path in (given.model, given.replay_buffer, given.vec_normalize):
         if path is not None and not path.is_file():
             raise SystemExit(f"{path} does not exist")
-    model = DDiffPG.load(given.model)
-    if given.replay_buffer is not None:
-        model.load_replay_buffer(given.replay_buffer)
+    if given.episodes < 1:
+        raise SystemExit(f"--episodes: {given.episodes} given; accepted are whole numbers from 1 up")
+    if given.output.is_dir() or given.output.suffix == ".json":
+        raise SystemExit(f"--output: {given.output} given; accepted is the path of a page, such as page.html")
     try:
-        task = Task.of(model, given.env, dict(given.env_kwargs))
-    except ValueError as error:
+        given.output.parent.mkdir(parents=True, exist_ok=True)
+        given.output.touch()
+        model = DDiffPG.load(given.model)
+        if given.replay_buffer is not None:
+            model.load_replay_buffer(given.replay_buffer)
+        task = replace(Task.of(model, given.env, dict(given.env_kwargs)), statistics=given.vec_normalize)
+        task.check(model)
+    except (OSError, ValueError) as error:
         raise SystemExit(str(error)) from error
-    videos = not given.no_videos
-    found = make_report(model, given.output, task, given.episodes, given.seed, videos, given.title, given.model.name)
+    command = _command(given, task)
+    found = make_report(model, given.output, task, given.episodes, given.seed, not given.no_videos, given.title, command)
     found.save(given.output.with_suffix(".json"))
     print(f"{found}\n\nwrote {given.output} and {given.output.with_suffix('.json')}")
 

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 import torch as th
-from environments import some_observations
+from environments import TwoEnds, small_model, some_observations
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from planar import belongings, planar_model, route_of, said, same, walk
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg import DDiffPG, Mode, reclustering
 from sb3_ddiffpg.modes import Outcome
 
 # ---------------------------------------------------------------------- names
@@ -42,11 +45,12 @@ def test_a_name_is_kept_for_life(two_routes, tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("", "is no name of a mode: accepted are 1 to 40 letters"),
+        ("", "is no name of a mode: accepted are 1 to 24 letters"),
         ("7", "not digits alone"),
         ("a/b", "is no name"),
         (" a", "is no name"),
-        ("x" * 41, "is no name"),
+        ("x" * 25, "is no name"),
+        ("_x", "is no name"),
         (3, "is no name"),
         ("mode_1", r"is another mode's; the modes are \['mode_0', 'mode_1'\]"),
         ("mode_5", "reserved for the mode that is born with it"),
@@ -132,6 +136,40 @@ def test_frozen_survives_saving(two_routes, tmp_path):
     loaded = DDiffPG.load(tmp_path / "model", env=two_routes.env)
     loaded.load_replay_buffer(tmp_path / "buffer")
     assert [mode.frozen for mode in loaded.modes] == [False, True] and loaded.replay_buffer.frozen_modes == {1}
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.booleans(), st.integers(1, 4), st.sampled_from([0.0, 0.5]))
+def test_whatever_clusters_are_found_a_frozen_mode_stays(seed, births, max_modes, ratio):
+    rng = np.random.default_rng(seed)
+    n, n_old = 12, int(rng.integers(1, 4))
+    modes = [Mode(i, f"mode_{i}", 0, frozen=bool(rng.random() < 0.5)) for i in range(n_old)]
+    old_labels = np.concatenate((np.arange(n_old), rng.integers(-1, n_old, n - n_old)))
+    labels = reclustering._defend(modes, rng.random((n, n)), old_labels, rng.integers(-1, 4, n), 0, max_modes)
+    labels = np.unique(np.append(labels, -1), return_inverse=True)[1][:-1] - 1  # numbered without gaps
+    labels = reclustering._worth_keeping(modes, rng.random(n), old_labels, labels, ratio, max_modes)
+    if not births:
+        labels = reclustering._without_births(modes, old_labels, labels)
+    inheritance = reclustering._match(modes, old_labels, labels)
+    kept = {parent for parent, keeps in zip(inheritance.parents, inheritance.kept, strict=True) if keeps}
+    assert {index for index, mode in enumerate(modes) if mode.frozen} <= kept
+
+
+def test_names_of_any_length_can_be_logged(two_routes):
+    two_routes.rename_mode(0, "a" * 24)
+    two_routes.rename_mode(1, "a" * 23 + "b")
+    two_routes.set_logger(configure(None, ["stdout", "log"]))
+    two_routes.recluster()
+    two_routes.logger.dump(0)
+
+
+def test_time_goes_on_through_a_second_run(tmp_path):
+    model = small_model(DummyVecEnv([TwoEnds] * 4)).learn(400).learn(200)
+    assert model.num_timesteps < 250 and model.lifetime_steps == 400 + model.num_timesteps
+    steps = [state.step for state in model.mode_history.states]
+    assert steps == sorted(steps) and steps[-1] > 400 and sorted(model.visits.coverage) == model.visits.coverage
+    model.save(tmp_path / "model")
+    assert DDiffPG.load(tmp_path / "model").lifetime_steps == model.lifetime_steps
 
 
 # ---------------------------------------------------------------------- deleting

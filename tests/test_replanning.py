@@ -22,7 +22,7 @@ class Stub:
     """Three modes; an action is the index of the mode that was commanded."""
 
     observation_space = spaces.Box(-10.0, 10.0, (3,))
-    gamma, success_key, _resolved_features = 0.9, None, [0, 1]
+    gamma, success_key, _resolved_features, is_normalized = 0.9, None, [0, 1], False
 
     def __init__(self, returns=(0.5, 1.0, 0.8), lengths=(5.0, 5.0, 5.0)):
         modes = [Mode(i, f"mode_{i}", 0, 5, mean_length=length) for i, length in enumerate(lengths)]

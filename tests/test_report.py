@@ -11,19 +11,29 @@ from html.parser import HTMLParser
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+import torch as th
 from environments import TwoEnds, small_model
 from PIL import Image
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_ddiffpg import DDiffPG, EvaluateModesCallback, ModeFigureCallback
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.episodes import EpisodeResult
-from sb3_ddiffpg.evaluation import ModeEvaluation
+from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
 from sb3_ddiffpg.history import ModeEvent, ModeHistory, ModeState
 from sb3_ddiffpg.pictures import CAPTIONS, draw_all
-from sb3_ddiffpg.plots import grid_observations, mode_color, plot_exploration, plot_routes, plot_success, plot_timeline
+from sb3_ddiffpg.plots import (
+    grid_observations,
+    mode_color,
+    plot_exploration,
+    plot_routes,
+    plot_success,
+    plot_timeline,
+    plot_values,
+)
+from sb3_ddiffpg.replanning import Replanner
 from sb3_ddiffpg.report import main
 from sb3_ddiffpg.visits import VisitMap
 
@@ -39,8 +49,8 @@ def run(tmp_path_factory):
     test_env = make_vec_env("PointMazeV1-v0", 2, seed=1, maze_map=MAP, start_noise=0.0)
     model = small_model(env, mode_patience=0)
     model.set_logger(configure(str(folder / "tb"), ["tensorboard"]))
-    evaluation = EvaluateModesCallback(test_env, eval_freq=600, n_episodes=2, path=folder / "log" / "evaluations.jsonl")
-    model.learn(1600, callback=[ModeFigureCallback(800, test_env, n_episodes=1), evaluation])
+    evaluation = EvaluateModesCallback(test_env, eval_freq=900, n_episodes=2, path=folder / "log" / "evaluations.jsonl")
+    model.learn(2400, callback=[ModeFigureCallback(1200, test_env, n_episodes=1), evaluation])
     assert len(model.modes) >= 2
     model.rename_mode(0, "to the left")
     model.save(folder / "model.zip")
@@ -139,7 +149,7 @@ def test_all_pictures_there_are(run):
 def test_evaluation_during_training(run):
     _, evaluation, folder = run
     steps = [step for step, _ in evaluation.evaluations]
-    assert steps[0] >= 600 and 1 <= len(steps) <= 2 and evaluation.evaluations[0][1].uncommanded.n_episodes == 4
+    assert steps[0] >= 900 and 1 <= len(steps) <= 2 and evaluation.evaluations[0][1].uncommanded.n_episodes == 4
     lines = [json.loads(line) for line in (folder / "log" / "evaluations.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == steps and "expected_modes_in_20" in lines[0]["summary"]
     (events,) = (folder / "tb").rglob("events.out.tfevents*")
@@ -193,7 +203,7 @@ def test_page_holds_everything(page):
     read = Page(path.read_text())
     assert read.open == [] and all(source.startswith("data:") for source in read.sources)
     for part in (
-        "The modes of model.zip on PointMazeV1-v0",
+        "Ways to solve PointMazeV1-v0",
         "to the left",
         "95 % interval",
         "renamed to to the left",
@@ -210,8 +220,8 @@ def test_page_holds_everything(page):
 
 def test_a_film_of_each_mode(page):
     model, path = page
-    for name in model.modes.names:
-        film = imageio.imread(path.with_name(f"report-{name.replace(' ', '_')}.mp4"))
+    for index, name in enumerate(model.modes.names):
+        film = imageio.imread(path.with_name(f"report-{index}-{name.replace(' ', '_')}.mp4"))
         assert film.ndim == 4 and film.shape[3] == 3 and len(film) >= 3 and film[0].std() > 5
 
 
@@ -240,6 +250,61 @@ def test_what_cannot_be_shown(tmp_path):
         ([], "--env: not given, and the model does not remember"),
         (["--env", "Nowhere-v0"], "--env: 'Nowhere-v0' is not registered"),
         (["--replay-buffer", str(tmp_path / "no.pkl")], "no.pkl does not exist"),
+        (["--episodes", "0"], "--episodes: 0 given"),
+        (["--output", str(tmp_path)], "accepted is the path of a page"),
+        (["--output", str(tmp_path / "page.json")], "accepted is the path of a page"),
+        (["--env", "Pendulum-v1"], "--env: Pendulum-v1 has observations and actions"),
+        (["--env", "PointMazeV1-v0", "--env-kwargs", "no_such=1"], "PointMazeV1-v0 cannot be made with"),
     ):
         with pytest.raises(SystemExit, match=message):
             main([*arguments, *extra])
+
+
+def test_normalised_observations(tmp_path):
+    """The page shows what the model does with the statistics that it was trained with, and none without."""
+    env = VecNormalize(make_vec_env("PointMazeV1-v0", 4, seed=0, maze_map=MAP), norm_reward=False)
+    model = small_model(env, mode_patience=0).learn(2400)
+    model.save(tmp_path / "model.zip")
+    env.save(str(tmp_path / "statistics.pkl"))
+    arguments = [str(tmp_path / "model.zip"), "--output", str(tmp_path / "page.html"), "--episodes", "4", "--no-videos"]
+    with pytest.raises(SystemExit, match="--vec-normalize: not given"):
+        main(arguments)
+    main([*arguments, "--vec-normalize", str(tmp_path / "statistics.pkl")])
+    found = ModeEvaluation.load(tmp_path / "page.json")
+    test_env = VecNormalize.load(
+        str(tmp_path / "statistics.pkl"), make_vec_env("PointMazeV1-v0", 4, maze_map=MAP, start_noise=0.0)
+    )
+    again = evaluate_modes(DDiffPG.load(tmp_path / "model.zip"), test_env, 4, seed=0)
+    assert [each.labels for each in again.commanded] == [each.labels for each in found.commanded]
+    before = test_env.obs_rms.mean.copy()
+    evaluate_modes(model, test_env, 2)
+    np.testing.assert_array_equal(test_env.obs_rms.mean, before)
+    # the values that are drawn are those of normalised observations
+    places = grid_observations(model, np.zeros(4, dtype=np.float32), model.env.get_attr("maze", 0)[0])
+    th.manual_seed(0)
+    drawn = plot_values(model, places).axes[0].collections[-1].get_array()
+    th.manual_seed(0)
+    np.testing.assert_allclose(drawn, model.mode_values(env.normalize_obs(places))[:, 0], rtol=1e-5)
+    with pytest.raises(ValueError, match="normalizer: None given"):
+        Replanner(DDiffPG.load(tmp_path / "model.zip"))
+    assert Replanner(model).normalizer is env
+
+
+def test_looking_on_changes_nothing():
+    """A run that is evaluated and drawn learns what it would have learned."""
+    policies = []
+    for looks in (False, True):
+        test_env = make_vec_env("PointMazeV1-v0", 2, seed=1, maze_map=MAP, start_noise=0.0)
+        callbacks = [EvaluateModesCallback(test_env, 200, 1, seed=3), ModeFigureCallback(300, test_env, 1)] if looks else None
+        model = small_model(make_vec_env("PointMazeV1-v0", 4, seed=0, maze_map=MAP), seed=5).learn(800, callback=callbacks)
+        policies.append([parameter.detach().clone() for parameter in model.policy.parameters()])
+    assert all(th.equal(first, second) for first, second in zip(*policies, strict=True))
+
+
+def test_one_dimension_is_drawn_too(trained):
+    rows = np.linspace(-1, 1, 5)[:, None].astype(np.float32) * np.ones((1, 2), dtype=np.float32)
+    figure = plot_values(trained, rows)
+    assert figure.axes[0].collections[-1].get_offsets()[:, 1].tolist() == [0] * 5
+    far = VisitMap(2, 1.0)
+    far.observe(np.array([[0.0, 0.0], [1e5, 0.0]]))
+    assert max(plot_exploration(far).axes[0].images[0].get_array().shape) <= 1001
