@@ -376,24 +376,26 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         windows = self._windows(rows, exploration_n_steps, mode_n_steps)
         present = windows >= 0
         powers = np.float32(gamma) ** np.arange(windows.shape[-1], dtype=np.float32)
-        rewards = self._normalize_reward(self.rewards[windows.ravel()], env).reshape(windows.shape)
+        rewards = self._normalize_reward(self.rewards.take(windows.ravel()), env).reshape(windows.shape)
         # For its mode a step off the route ends the episode without reward, so that no way back is worth anything
-        lost = np.logical_or.accumulate(self.off_route[windows] & present, axis=-1)
+        lost = np.logical_or.accumulate(self.off_route.take(windows) & present, axis=-1)
         lost[EXPLORATORY_GROUP] = False
         # What led away from the route is for the critic to judge, not for the policy to follow
-        imitated = active[:, None] & ~self.foreign[rows]
+        imitated = active[:, None] & ~self.foreign.take(rows)
         imitated[EXPLORATORY_GROUP] = True
         rewards = (np.where(present & ~lost, rewards, 0.0) * powers).sum(axis=-1)  # [G, n]
         lengths = present.sum(axis=-1)
         last = np.take_along_axis(windows, lengths[..., None] - 1, axis=-1)[..., 0]
-        continues = (~self.dones[last] | self.timeouts[last]) & ~lost.any(axis=-1)
+        continues = (~self.dones.take(last) | self.timeouts.take(last)) & ~lost.any(axis=-1)
         discounts = np.float32(gamma) ** lengths * continues
         obs = self._normalize_obs(self._read(self.observations, rows.ravel()), env)
         next_obs = self._normalize_obs(self._read(self.next_observations, last.ravel()), env)
-        targets = np.concatenate((self.exploratory_target_actions[rows[:1]], self.target_actions[rows[1:]]))
+        targets = np.concatenate(
+            (self.exploratory_target_actions.take(rows[:1], axis=0), self.target_actions.take(rows[1:], axis=0))
+        )
         return ModeBatch(
             observations=self._tensors(obs),
-            actions=self.to_torch(self.actions[rows]),
+            actions=self.to_torch(self.actions.take(rows, axis=0)),
             target_actions=self.to_torch(targets),
             next_observations=self._tensors(next_obs),
             rewards=self.to_torch(rewards.astype(np.float32)),
@@ -411,7 +413,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         windows[..., 0] = rows
         for k in range(1, n_steps):
             previous = windows[..., k - 1]
-            windows[..., k] = np.where(previous >= 0, self.next_row[previous], -1)
+            windows[..., k] = np.where(previous >= 0, self.next_row.take(previous), -1)
         windows[0, :, exploration_n_steps:] = -1
         windows[1:, :, mode_n_steps:] = -1
         return windows

@@ -296,7 +296,12 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         return sorted(found, key=lambda trajectory: trajectory.serial)
 
     def _read(self, array: Any, rows: np.ndarray) -> Any:
-        return {key: value[rows] for key, value in array.items()} if isinstance(array, dict) else array[rows]
+        # Not array[rows]: in a large buffer `take` is three times as fast
+        return (
+            {key: value.take(rows, axis=0) for key, value in array.items()}
+            if isinstance(array, dict)
+            else array.take(rows, axis=0)
+        )
 
     def read_observations(self, rows: np.ndarray, env: VecNormalize | None = None) -> tuple[Any, Any]:
         """
