@@ -94,19 +94,21 @@ class ModeCritics(nn.Module):
         kind = 0 if group == 0 else 1
         self.biases[-1].data[group] = -8.0 * self.atoms[kind].abs() / (self.upper[kind] - self.lower[kind])
 
-    def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def forward(self, features: th.Tensor, actions: th.Tensor, frozen: bool = False) -> th.Tensor:
         """
         :param features: Observation features of each group's rows, shape [G, n, F]
         :param actions: Shape [G, n, A]
+        :param frozen: Whether the weights are constants, which makes a gradient with respect to the actions cheaper
         :return: Logits over the atoms (values when scalar), shape [G, C, n, n_atoms]
         """
-        first, bias = self.weights[0], self.biases[0]
+        weights = [weight.detach() if frozen else weight for weight in self.weights]
+        biases = [bias.detach() if frozen else bias for bias in self.biases]
         groups, rows = features.shape[:2]
         n_nets = groups * self.n_critics
         # [G, n, F + A] -> [G * C, n, F + A]
         hidden = th.cat((features, actions), dim=2)[:, None].expand(-1, self.n_critics, -1, -1).reshape(n_nets, rows, -1)
-        hidden = th.baddbmm(bias.flatten(0, 1), hidden, first.flatten(0, 1))
-        for weight, bias in zip(self.weights[1:], self.biases[1:], strict=True):
+        hidden = th.baddbmm(biases[0].flatten(0, 1), hidden, weights[0].flatten(0, 1))
+        for weight, bias in zip(weights[1:], biases[1:], strict=True):
             hidden = th.baddbmm(bias.flatten(0, 1), self.activation(hidden), weight.flatten(0, 1))
         return hidden.unflatten(0, (groups, self.n_critics))
 
@@ -171,7 +173,7 @@ class ModeCritics(nn.Module):
         """
         actions = actions.detach().requires_grad_()
         with th.enable_grad():
-            value = self.values(self(features, actions)).min(dim=1).values.sum()
+            value = self.values(self(features, actions, frozen=True)).min(dim=1).values.sum()
         return th.autograd.grad(value, actions)[0]
 
     @th.no_grad()
