@@ -146,6 +146,25 @@ def small(seconds: float) -> None:
     print(f"  {'SB3 TD3, a whole update':<48} {found['TD3']:9.2f}   {found['DDiffPG'] / found['TD3']:.2f}x")
 
 
+def check_equal(model: DDiffPG, plain: PlainUpdate) -> None:
+    """
+    :param model: A model
+    :param plain: Made from it
+    :raises AssertionError: If the two do not compute the same actions and gradients
+    """
+    policy = model.policy
+    features, actions = th.randn(N_MODES + 1, 64, 29), th.rand(N_MODES + 1, 64, 8) * 2 - 1
+    noise = th.randn(model.n_diffusion_steps, 64, 8)
+    condition = th.cat((features[1], policy.mode_embeddings[1].expand(64, -1)), dim=1)
+    with th.no_grad():
+        th.testing.assert_close(
+            policy.actor.diffusion.sample(condition, noise=noise), plain.denoise(condition, noise), rtol=1e-4, atol=1e-5
+        )
+    ours = policy.critics.action_gradient(features, actions)
+    theirs = th.stack([plain.action_gradient(group, features[group], actions[group]) for group in range(N_MODES + 1)])
+    th.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-5)
+
+
 def paper(batch_size: int, seconds: float, activation: str) -> None:
     """
     :param batch_size: Transitions of an update
@@ -162,7 +181,9 @@ def paper(batch_size: int, seconds: float, activation: str) -> None:
         sizes = dict(pi=[1024, 512, 256], qf=[512, 256, 128])
         return dict(net_arch=sizes, activation_fn=activation_fn, critic_activation_fn=nn.ELU, time_embedding_dim=256)
 
-    plain = PlainUpdate(filled(29, 8, **settings, policy_kwargs=kwargs(nn.Mish)))
+    reference = filled(29, 8, **settings, policy_kwargs=kwargs(nn.Mish))
+    plain = PlainUpdate(reference)
+    check_equal(reference, plain)
     model = filled(29, 8, **settings, policy_kwargs=kwargs(nn.Mish if activation == "mish" else nn.SiLU))
     calls = {"ours": lambda: model.train(1, batch_size), "plain": lambda: plain(batch_size)}
     found = median_ms(calls, seconds)
