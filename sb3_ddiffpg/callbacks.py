@@ -96,7 +96,32 @@ class ModeEvalCallback(EvalCallback):
         return super()._on_step()
 
 
-class EvaluateModesCallback(BaseCallback):
+class _PeriodicCallback(BaseCallback):
+    """After every so many environment steps, at the end of a rollout."""
+
+    def __init__(self, name: str, period: int) -> None:
+        super().__init__()
+        if period < 1:
+            raise ValueError(f"{name} must be at least 1, got {period}")
+        self._period = period
+        self._next = 0
+
+    def _on_training_start(self) -> None:
+        self._next = self.model.num_timesteps + self._period
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if self.num_timesteps >= self._next:
+            self._next = self.num_timesteps + self._period
+            self._on_period()
+
+    def _on_period(self) -> None:
+        raise NotImplementedError
+
+
+class EvaluateModesCallback(_PeriodicCallback):
     """
     Runs :func:`~sb3_ddiffpg.evaluation.evaluate_modes` during training and logs what follows from it under ``eval_modes/``.
     Give it environments with one fixed start.
@@ -111,31 +136,17 @@ class EvaluateModesCallback(BaseCallback):
     def __init__(
         self, eval_env: VecEnv, eval_freq: int = 10_000, n_episodes: int = 20, path: str | Path | None = None, **kwargs: Any
     ) -> None:
-        super().__init__()
-        if eval_freq < 1:
-            raise ValueError(f"eval_freq must be at least 1, got {eval_freq}")
-        self.eval_env, self.eval_freq, self.n_episodes, self.kwargs = eval_env, eval_freq, n_episodes, kwargs
+        super().__init__("eval_freq", eval_freq)
+        self.eval_env, self.n_episodes, self.kwargs = eval_env, n_episodes, kwargs
         self.path = None if path is None else Path(path)
         #: Environment steps and what was found
         self.evaluations: list[tuple[int, ModeEvaluation]] = []
-        self._next = 0
 
     def _init_callback(self) -> None:
         if self.path is not None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
 
-    def _on_training_start(self) -> None:
-        self._next = self.model.num_timesteps + self.eval_freq
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_end(self) -> None:
-        if self.num_timesteps >= self._next:
-            self._next = self.num_timesteps + self.eval_freq
-            self._evaluate()
-
-    def _evaluate(self) -> None:
+    def _on_period(self) -> None:
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
         with preserved_rng():
@@ -158,7 +169,7 @@ class EvaluateModesCallback(BaseCallback):
                 file.write(json.dumps({"step": self.num_timesteps, **found.to_dict()}) + "\n")
 
 
-class ModeFigureCallback(BaseCallback):
+class ModeFigureCallback(_PeriodicCallback):
     """
     Shows the pictures of :mod:`~sb3_ddiffpg.plots` in TensorBoard during training. Needs the extra ``plots``.
 
@@ -168,26 +179,14 @@ class ModeFigureCallback(BaseCallback):
     """
 
     def __init__(self, figure_freq: int = 50_000, eval_env: VecEnv | None = None, n_episodes: int = 5) -> None:
-        super().__init__()
-        if figure_freq < 1:
-            raise ValueError(f"figure_freq must be at least 1, got {figure_freq}")
+        super().__init__("figure_freq", figure_freq)
         # Not at the top: matplotlib is not needed to train
         from sb3_ddiffpg import pictures
 
         self._draw: Callable[..., dict[str, Any]] = pictures.draw_all
-        self.figure_freq, self.eval_env, self.n_episodes = figure_freq, eval_env, n_episodes
-        self._next = 0
+        self.eval_env, self.n_episodes = eval_env, n_episodes
 
-    def _on_training_start(self) -> None:
-        self._next = self.model.num_timesteps + self.figure_freq
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_end(self) -> None:
-        if self.num_timesteps < self._next:
-            return
-        self._next = self.num_timesteps + self.figure_freq
+    def _on_period(self) -> None:
         with preserved_rng():
             figures = self._figures()
         for name, figure in figures.items():

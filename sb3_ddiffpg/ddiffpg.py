@@ -570,10 +570,10 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
 
     def _store_transition(self, replay_buffer: ModeReplayBuffer, *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
         super()._store_transition(replay_buffer, *args, **kwargs)
-        positions = th.as_tensor(replay_buffer.last_positions(), device=self.device)
-        self.novelty_model.observe(positions)
+        positions = replay_buffer.last_positions()
+        self.novelty_model.observe(th.as_tensor(positions, device=self.device))
         if self.visits is not None:
-            self.visits.observe(replay_buffer.last_positions())
+            self.visits.observe(positions)
         for env, trajectory in replay_buffer.just_finished:
             mode = self._behavior.commanded_mode(env)
             if mode is not None:

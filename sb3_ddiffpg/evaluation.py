@@ -5,11 +5,9 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import binomtest
@@ -19,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.clustering import cluster
 from sb3_ddiffpg.dtw import dtw_distances, erase_loops, resample_path
-from sb3_ddiffpg.envs import make_vec_env
+from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.episodes import EpisodeResult, run_episodes
 from sb3_ddiffpg.rng import preserved_rng
 from sb3_ddiffpg.trajectories import NO_MODE
@@ -307,10 +305,7 @@ def evaluate_modes(
         if name not in known:
             raise ValueError(f"modes: {name!r} given; the model's modes are {known}")
     if isinstance(env, str):
-        module, _, name = env.rpartition(":")
-        if module:
-            import_module(module)
-        if str(gym.spec(name).entry_point).startswith("sb3_ddiffpg."):
+        if is_ours(env):
             env_kwargs = {"start_noise": 0.0, **env_kwargs}
         made = make_vec_env(env, min(n_episodes, 25), seed=seed, **env_kwargs)
         try:

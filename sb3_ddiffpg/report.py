@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 
 from sb3_ddiffpg import pictures, plots
 from sb3_ddiffpg.ddiffpg import DDiffPG
-from sb3_ddiffpg.envs import make_vec_env
+from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
 
 _PACKAGES = ("sb3_ddiffpg", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy")
@@ -66,7 +66,7 @@ class Task:
             kwargs = {name: value for name, value in kwargs.items() if name != "render_mode" and value is not None}
         if env_id not in gym.registry:
             raise ValueError(f"--env: {env_id!r} is not registered")
-        if str(gym.spec(env_id).entry_point).startswith("sb3_ddiffpg."):
+        if is_ours(env_id):
             kwargs["start_noise"] = 0.0
         return Task(env_id, {**kwargs, **(env_kwargs or {})})
 

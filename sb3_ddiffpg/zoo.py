@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_ddiffpg.callbacks import ModeEvalCallback
 from sb3_ddiffpg.ddiffpg import DDiffPG
-from sb3_ddiffpg.envs import make_vec_env
+from sb3_ddiffpg.envs import is_ours, make_vec_env
 
 try:
     import optuna
@@ -142,9 +142,8 @@ class ModeExperimentManager(ExperimentManager):
         :return: Environments that step together for the tasks of this package, otherwise what the zoo makes
         """
         env_id = self.env_name.gym_id
-        ours = str(gym.spec(env_id).entry_point).startswith("sb3_ddiffpg.")
         wrapped = self.env_wrapper is not None or self.frame_stack is not None
-        if not ours or wrapped or self.vec_env_class is SubprocVecEnv:
+        if not is_ours(env_id) or wrapped or self.vec_env_class is SubprocVecEnv:
             return super().create_envs(n_envs, eval_env, no_log)
         env_kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
         monitor_file = None if eval_env or no_log else os.path.join(self.save_path, "0")

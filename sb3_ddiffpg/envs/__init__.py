@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.envs.registration import load_env_creator
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 from stable_baselines3.common.env_util import make_vec_env as make_sb3_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
@@ -23,6 +23,7 @@ __all__ = [
     "Maze",
     "PointMazeEnv",
     "PointMazeVecEnv",
+    "is_ours",
     "make_vec_env",
     "reduce_word",
 ]
@@ -46,6 +47,21 @@ for _name in ("Reach", "PegInHole", "DrawerClose", "CabinetOpen"):
     gym.register(f"Franka{_name}-v0", entry_point=f"{_FRANKA}{_name}", max_episode_steps=100)
 
 
+def is_ours(env_id: str) -> bool:
+    """
+    :param env_id: id of a registered environment, perhaps with the module that registers it: ``"module:id"``
+    :return: whether it is a task of this package
+    """
+    return str(_spec(env_id).entry_point).startswith("sb3_ddiffpg.")
+
+
+def _spec(env_id: str) -> EnvSpec:
+    module, _, name = env_id.rpartition(":")
+    if module:
+        import_module(module)
+    return gym.spec(name)
+
+
 def make_vec_env(
     env_id: str, n_envs: int = 1, seed: int | None = None, n_threads: int | None = None, **env_kwargs: Any
 ) -> VecEnv:
@@ -63,10 +79,7 @@ def make_vec_env(
     :param env_kwargs: arguments of ``gym.make``, such as ``max_episode_steps`` or ``maze_map``
     :return: the vectorised environment, with monitor
     """
-    module, _, name = env_id.rpartition(":")
-    if module:
-        import_module(module)
-    spec = gym.spec(name)
+    spec = _spec(env_id)
     if n_envs < 1:
         raise ValueError(f"n_envs: {n_envs} given; accepted are whole numbers from 1 up")
     if str(spec.entry_point).startswith(_FRANKA):
