@@ -1,7 +1,9 @@
 """When to re-cluster, and what evaluation during training shows of the modes."""
 
 import json
+import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -130,29 +132,43 @@ class EvaluateModesCallback(_PeriodicCallback):
     :param eval_freq: Environment steps between two evaluations
     :param n_episodes: Episodes for each command, and twice as many without
     :param path: Of a file to which each evaluation is appended, one line of JSON each
+    :param best_model_path: Where the model is saved whenever its ``commanded_modes`` (then its uncommanded successes) are as
+        many as never before. Evaluate it again, in fresh episodes, before you report it: it was chosen for these
     :param kwargs: Further arguments of ``evaluate_modes``
     """
 
     def __init__(
-        self, eval_env: VecEnv, eval_freq: int = 10_000, n_episodes: int = 20, path: str | Path | None = None, **kwargs: Any
+        self,
+        eval_env: VecEnv,
+        eval_freq: int = 10_000,
+        n_episodes: int = 20,
+        path: str | Path | None = None,
+        best_model_path: str | Path | None = None,
+        **kwargs: Any,
     ) -> None:
         super().__init__("eval_freq", eval_freq)
         self.eval_env, self.n_episodes, self.kwargs = eval_env, n_episodes, kwargs
         self.path = None if path is None else Path(path)
-        #: Environment steps and what was found
+        self.best_model_path = None if best_model_path is None else Path(best_model_path)
+        #: Environment steps at which the best model was saved, None: not yet
+        self.best_step: int | None = None
+        self._best = (-1.0, -1.0)
+        #: Environment steps and what was found, without the episodes
         self.evaluations: list[tuple[int, ModeEvaluation]] = []
 
     def _init_callback(self) -> None:
-        if self.path is not None:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+        for path in (self.path, self.best_model_path):
+            if path is not None:
+                path.parent.mkdir(parents=True, exist_ok=True)
 
     def _on_period(self) -> None:
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
         with preserved_rng():
             found = evaluate_modes(self.model, self.eval_env, self.n_episodes, **self.kwargs)
-        self.evaluations.append((self.num_timesteps, found))
+        self.evaluations.append((self.num_timesteps, replace(found, episodes={})))
         values = {
+            "commanded_modes": found.commanded_modes,
             "expected_modes": found.expected_modes(),
             "robust_modes": found.robust_modes,
             "effective_modes": found.effective_modes,
@@ -167,6 +183,12 @@ class EvaluateModesCallback(_PeriodicCallback):
         if self.path is not None:
             with self.path.open("a") as file:
                 file.write(json.dumps({"step": self.num_timesteps, **found.to_dict()}) + "\n")
+        score = (found.commanded_modes, found.uncommanded.success_rate)
+        if self.best_model_path is not None and score > self._best:
+            self._best, self.best_step = score, self.num_timesteps
+            unfinished = self.best_model_path.with_name(f".{self.best_model_path.stem}.zip")
+            self.model.save(unfinished)
+            os.replace(unfinished, self.best_model_path)  # whole, or the one before
 
 
 class ModeFigureCallback(_PeriodicCallback):

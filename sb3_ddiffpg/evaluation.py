@@ -165,6 +165,12 @@ class ModeEvaluation:
         return {str(self.commanded[row].mode): self.labels[column] for row, column in pairs if counts[row, column]}
 
     @property
+    def commanded_modes(self) -> float:
+        """How many ways can be commanded: the share of episodes that took their mode's own way, summed over the modes."""
+        episodes = {str(each.mode): each for each in self.commanded}
+        return sum(episodes[mode].labels[way] / episodes[mode].n_episodes for mode, way in self.matching.items())
+
+    @property
     def control_accuracy(self) -> float:
         """Share of the commanded episodes that reached the goal by their mode's own way; NaN without modes."""
         n_right = sum(each.labels.get(self.matching.get(str(each.mode), ""), 0) for each in self.commanded)
@@ -210,6 +216,7 @@ class ModeEvaluation:
             "robust_modes": self.robust_modes,
             "effective_modes": self.effective_modes,
             "coverage": _number(self.coverage),
+            "commanded_modes": self.commanded_modes,
             "control_accuracy": _number(self.control_accuracy),
             "commandable": self.commandable,
             "matching": self.matching,

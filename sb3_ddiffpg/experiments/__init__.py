@@ -1,0 +1,1 @@
+"""Experiments that leave a record: one run, its settings, curve, model and evaluation."""

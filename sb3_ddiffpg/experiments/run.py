@@ -1,0 +1,210 @@
+"""
+One training run that leaves all that is needed to judge it and to do it again, in one folder: ``model.zip``,
+``evaluation.json``, ``curve.csv`` and ``config.yml``.
+
+``python -m sb3_ddiffpg.experiments.run --env AntMazeV1-v0 --conf-file ddiffpg-cpu --seed 1 --out results/AntMazeV1-v0/seed1``,
+and to repeat a recorded one ``python -m sb3_ddiffpg.experiments.run --again results/AntMazeV1-v0/seed1 --out DIR``.
+"""
+
+import argparse
+import csv
+import os
+import platform
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch as th
+import yaml
+
+from sb3_ddiffpg.callbacks import EvaluateModesCallback
+from sb3_ddiffpg.envs import is_ours, make_vec_env
+from sb3_ddiffpg.evaluation import evaluate_modes
+from sb3_ddiffpg.zoo import ALGO, ALGOS, ModeExperimentManager, config_file, register
+
+# How often the modes are tested in training, as a share of the run, and in how many episodes for each command
+N_TESTS, N_TEST_EPISODES = 30, 20
+N_EPISODES = 100
+PACKAGES = ("sb3_ddiffpg", "stable_baselines3", "torch", "gymnasium", "mujoco", "pybullet", "numpy", "numba")
+
+
+class CurveCallback(EvaluateModesCallback):
+    """
+    Keeps the best model so far, and a line of ``curve.csv`` for each test of it.
+
+    :param folder: Of the run
+    :param kwargs: Of ``EvaluateModesCallback``
+    """
+
+    def __init__(self, folder: Path, **kwargs: Any) -> None:
+        super().__init__(path=folder / "logs" / "evaluations.jsonl", best_model_path=folder / "model.zip", **kwargs)
+        self.folder = folder
+        self._started = time.perf_counter()
+
+    def _on_period(self) -> None:
+        super()._on_period()
+        step, found = self.evaluations[-1]
+        row: dict[str, Any] = {
+            "step": step,
+            "hours": round((time.perf_counter() - self._started) / 3600, 4),
+            "updates": self.model._n_updates,
+            "modes": len(getattr(self.model, "modes", ())),
+            "commanded_modes": round(found.commanded_modes, 3),
+            "expected_modes": round(found.expected_modes(), 3),
+            "robust_modes": found.robust_modes,
+            "success_rate": round(found.uncommanded.success_rate, 3),
+        }
+        for label in found.listed:
+            shares = [each.labels.get(label, 0) / each.n_episodes for each in (*found.commanded, found.uncommanded)]
+            row[label] = round(max(shares), 3)
+        path = self.folder / "curve.csv"
+        new = len(self.evaluations) == 1
+        with path.open("w" if new else "a", newline="") as file:
+            writer = csv.DictWriter(file, list(row))
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+
+
+def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: Path) -> None:
+    """
+    Train, test along the way, keep the best model, and evaluate it with fresh seeds.
+
+    :param algo: Name of the algorithm in the zoo
+    :param env_id: Of the environment
+    :param seed: Of the run
+    :param hyperparams: As in an entry of the zoo's YAML files
+    :param folder: Where the record goes; must not hold another one
+    """
+    if (folder / "config.yml").exists():
+        raise SystemExit(f"--out: {folder} holds a run already; accepted is a folder without one")
+    register()
+    (folder / "logs").mkdir(parents=True, exist_ok=True)
+    entry = folder / "logs" / "hyperparams.yml"
+    entry.write_text(yaml.safe_dump({env_id: hyperparams}))
+    manager = ModeExperimentManager(
+        argparse.Namespace(),
+        algo,
+        env_id,
+        str(folder / "logs"),
+        seed=seed,
+        config=str(entry),
+        eval_freq=-1,
+        log_interval=-2,
+        verbose=1,
+    )
+    manager.save_path = str(folder / "logs")
+    manager.params_path = str(folder / "logs")
+    prepared = manager.setup_experiment()
+    assert prepared is not None
+    model = prepared[0]
+    record: dict[str, Any] = {
+        "algo": algo,
+        "env": env_id,
+        "seed": seed,
+        "hyperparams": hyperparams,
+        "command": " ".join([Path(sys.executable).name, *sys.argv]),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "git_commit": _git_commit(),
+        "machine": _machine(),
+        "versions": _versions(),
+    }
+    (folder / "config.yml").write_text(yaml.safe_dump(record, sort_keys=False))
+    test_env = _test_env(env_id, manager.env_kwargs, seed)
+    curve = CurveCallback(folder, eval_env=test_env, eval_freq=manager.n_timesteps // N_TESTS, n_episodes=N_TEST_EPISODES)
+    manager.callbacks.append(curve)
+    started, cpu = time.perf_counter(), time.process_time()
+    manager.learn(model)
+    record["result"] = {
+        "steps": model.num_timesteps,
+        "updates": model._n_updates,
+        "hours": round((time.perf_counter() - started) / 3600, 3),
+        "cpu_hours": round((time.process_time() - cpu) / 3600, 3),
+        "best_step": curve.best_step,
+    }
+    (folder / "config.yml").write_text(yaml.safe_dump(record, sort_keys=False))
+    model.save(folder / "logs" / "final_model.zip")
+    for name, path in (("final", folder / "logs" / "final_model.zip"), ("best", folder / "model.zip")):
+        found = evaluate_modes(ALGOS[algo].load(path), test_env, N_EPISODES, seed=seed + 1_000)
+        found.save(folder / ("evaluation.json" if name == "best" else "logs/evaluation_final.json"))
+        print(f"\n{name} model\n{found}")
+    test_env.close()
+
+
+def _test_env(env_id: str, env_kwargs: dict[str, Any], seed: int) -> Any:
+    """One fixed start, for the tasks that have start noise."""
+    fixed = {"start_noise": 0.0} if is_ours(env_id) else {}
+    return make_vec_env(env_id, N_TEST_EPISODES, seed=seed + 500, **{**env_kwargs, **fixed})
+
+
+def _git_commit() -> str | None:
+    root = Path(__file__).parents[2]
+    try:
+        done = subprocess.run(
+            ["git", "-C", root, "describe", "--always", "--dirty"], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
+
+
+def _machine() -> dict[str, Any]:
+    return {
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "torch_threads": th.get_num_threads(),
+        "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor()
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def main() -> None:
+    """Read the command line, and run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--algo", default=ALGO)
+    parser.add_argument("--env")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--conf-file", default=ALGO, help="a YAML file as the zoo's, or the name of one of ours")
+    parser.add_argument("--override", type=yaml.safe_load, default={}, help="settings as YAML, such as '{n_timesteps: 1e5}'")
+    parser.add_argument("--again", type=Path, help="folder of a recorded run: same algorithm, environment, seed and settings")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the record")
+    given = parser.parse_args()
+    if given.again is not None:
+        recorded = yaml.safe_load((given.again / "config.yml").read_text())
+        algo, env_id, seed, hyperparams = (recorded[key] for key in ("algo", "env", "seed", "hyperparams"))
+    elif given.env is not None:
+        algo, env_id, seed = given.algo, given.env, given.seed
+        path = config_file(given.conf_file) or Path(given.conf_file)
+        entries = yaml.safe_load(path.read_text())
+        if env_id not in entries:
+            raise SystemExit(f"--env: {env_id!r} given; {path.name} has settings for {', '.join(sorted(entries))}")
+        hyperparams = entries[env_id]
+    else:
+        raise SystemExit("--env or --again is needed")
+    run(algo, env_id, seed, {**hyperparams, **given.override}, given.out)
+
+
+if __name__ == "__main__":
+    main()
