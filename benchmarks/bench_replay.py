@@ -4,12 +4,13 @@ run, one thread; the ratio says whether cost depends on size. Usage: ``python be
 """
 
 import argparse
-import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from timing import median_ms
 
 from sb3_ddiffpg import ModeReplayBuffer
 
@@ -46,48 +47,26 @@ def filled(size: int) -> tuple[ModeReplayBuffer, Callable[[], None]]:
     return buffer, add
 
 
-def median_ms(call: Callable[[], Any], seconds: float) -> float:
-    """
-    :param call: What to measure
-    :param seconds: For how long
-    :return: Median milliseconds of CPU
-    """
-    times = []
-    end = time.perf_counter() + seconds
-    while time.perf_counter() < end:
-        started = time.process_time()
-        call()
-        times.append(time.process_time() - started)
-    return 1e3 * float(np.median(times))
-
-
-def megabytes(buffer: ModeReplayBuffer) -> float:
-    """
-    :param buffer: A buffer
-    :return: Size of its arrays
-    """
-    arrays = [getattr(buffer, name) for name in buffer._row_arrays()]
-    return sum(array.nbytes for array in arrays) / 1e6
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=3.0, help="time spent on each entry")
+    parser.add_argument("--seconds", type=float, default=6.0, help="time spent on each column")
     parser.add_argument("--batch", type=int, default=4096, help="transitions of a sample")
     given = parser.parse_args()
-    print(f"transitions   sample {given.batch} (ms)   add, per environment (us)     MB   bytes/transition")
-    first: tuple[float, float] | None = None
+    buffers = {f"{size:,}": filled(size) for size in SIZES}
+    columns: dict[str, dict[str, float]] = {}
+    for n_steps in (1, 5):
+        calls = {name: partial(buffer.sample_modes, given.batch, 0.99, 1, n_steps) for name, (buffer, _) in buffers.items()}
+        columns[f"sample {given.batch}, {n_steps}-step (ms)"] = median_ms(calls, given.seconds)
+    added = median_ms({name: add for name, (_, add) in buffers.items()}, given.seconds)
+    columns["add, per environment (us)"] = {name: 1e3 * added[name] / buffers[name][0].n_envs for name in buffers}
+    print("transitions   " + "   ".join(f"{title:>27}" for title in columns) + "      MB   bytes/transition")
+    smallest = f"{SIZES[0]:,}"
     for size in SIZES:
-        buffer, add = filled(size)
-        sample = median_ms(lambda buffer=buffer: buffer.sample_modes(given.batch, 0.99, 1, 1), given.seconds)  # type: ignore[misc]
-        adding = 1e3 * median_ms(add, given.seconds) / buffer.n_envs
-        first = first or (sample, adding)
-        memory = megabytes(buffer)
-        print(
-            f"{size:>11,} {sample:12.2f} ({sample / first[0]:4.2f}x) {adding:19.2f} ({adding / first[1]:4.2f}x)"
-            f" {memory:6.0f} {1e6 * memory / size:18.0f}"
-        )
+        name = f"{size:,}"
+        cells = [f"{column[name]:18.2f} ({column[name] / column[smallest]:5.2f}x)" for column in columns.values()]
+        stored = buffers[name][0].storage_bytes
+        print(f"{name:>11}   " + "   ".join(cells) + f"   {stored / 1e6:5.0f} {stored / size:18.0f}")
 
 
 if __name__ == "__main__":

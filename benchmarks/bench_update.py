@@ -20,6 +20,7 @@ from plain_update import PlainUpdate
 from stable_baselines3 import TD3
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
+from timing import median_ms
 from torch import nn
 
 from sb3_ddiffpg import DDiffPG
@@ -84,22 +85,6 @@ def filled(observation_dim: int, action_dim: int, **settings: Any) -> DDiffPG:
     return model
 
 
-def median_ms(calls: dict[str, Callable[[], Any]], seconds: float) -> dict[str, float]:
-    """
-    :param calls: What to measure, in turns
-    :param seconds: For how long
-    :return: Median milliseconds of CPU by name
-    """
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    end = time.perf_counter() + seconds
-    while time.perf_counter() < end or len(next(iter(times.values()))) < 3:
-        for name, call in calls.items():
-            started = time.process_time()
-            call()
-            times[name].append(time.process_time() - started)
-    return {name: 1e3 * float(np.median(values)) for name, values in times.items()}
-
-
 def parts_ms(model: DDiffPG, batch_size: int, n_updates: int) -> dict[str, float]:
     """
     :param model: A filled model
@@ -160,7 +145,7 @@ def check_equal(model: DDiffPG, plain: PlainUpdate) -> None:
         th.testing.assert_close(
             policy.actor.diffusion.sample(condition, noise=noise), plain.denoise(condition, noise), rtol=1e-4, atol=1e-5
         )
-    ours = policy.critics.action_gradient(features, actions)
+    ours = policy.critics.action_gradient(features)(actions)
     theirs = th.stack([plain.action_gradient(group, features[group], actions[group]) for group in range(N_MODES + 1)])
     th.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-5)
 

@@ -115,7 +115,9 @@ class PlainUpdate:
         model, policy = self.model, self.model.policy
         batch = model.replay_buffer.sample_modes(batch_size, model.gamma, model.exploration_n_steps, model.mode_n_steps)
         n_groups, n = batch.rows.shape
-        positions = th.as_tensor(model.replay_buffer.features(model.replay_buffer.read_observations(batch.rows[0])[1]))
+        positions = th.as_tensor(
+            model.replay_buffer.features.of_tensors(model.replay_buffer.read_observations(batch.rows[0])[1])
+        )
         features = policy.critic_features(batch.observations).detach()
         next_features = policy.critic_features(batch.next_observations).detach()
         inputs = next_features[0] if getattr(self.novelty, "with_observation", False) else positions

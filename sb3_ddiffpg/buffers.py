@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
 from sb3_ddiffpg.dtw import erase_loops, resample_path
 from sb3_ddiffpg.features import ModeFeatures
+from sb3_ddiffpg.row_storage import Fields
 from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, Trajectory
 from sb3_ddiffpg.trajectory_buffer import TrajectoryReplayBuffer
 
@@ -58,6 +59,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     :param optimize_memory_usage: Not supported
     :param handle_timeout_termination: Whether time limits are bootstrapped through
     :param success_key: See ``TrajectoryReplayBuffer``
+    :param storage_device: See ``TrajectoryReplayBuffer``
     :param mode_features: See ``ModeFeatures``
     :param max_successes_per_mode: Newest goal-reached trajectories that train a mode; older ones serve exploration only
     :param max_failures_per_mode: Newest failed trajectories that train a mode
@@ -72,8 +74,10 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     :raises ValueError: If a size is not positive or ``optimize_memory_usage`` is asked for
     """
 
-    target_actions: np.ndarray
-    exploratory_target_actions: np.ndarray
+    target_actions: Any
+    exploratory_target_actions: Any
+    foreign: np.ndarray
+    off_route: np.ndarray
 
     def __init__(
         self,
@@ -85,6 +89,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
         success_key: str | None = None,
+        storage_device: th.device | str = "cpu",
         mode_features: Any = None,
         max_successes_per_mode: int = 40,
         max_failures_per_mode: int = 20,
@@ -124,6 +129,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             optimize_memory_usage=optimize_memory_usage,
             handle_timeout_termination=handle_timeout_termination,
             success_key=success_key,
+            storage_device=storage_device,
         )
 
     # ------------------------------------------------------------------ storage
@@ -135,26 +141,37 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self._feature_scale: np.ndarray | None = None
         self._distances = DistanceCache(self.normalize_distances)
         self._mode_position = np.empty(0, dtype=np.int32)
+        self._last_positions = np.empty((0, self.features.dim), dtype=np.float32)
         self.mode_rows: list[RowSet] = []
 
-    def _row_arrays(self) -> list[str]:
-        own = ["target_actions", "exploratory_target_actions", "foreign", "off_route", "_mode_position"]
-        return [*super()._row_arrays(), *own]
+    def _step_fields(self) -> Fields:
+        action = ((self.action_dim,), np.float32)
+        return {**super()._step_fields(), "target_actions": action, "exploratory_target_actions": action}
+
+    def _note_fields(self) -> Fields:
+        return {**super()._note_fields(), "foreign": ((), bool), "off_route": ((), bool)}
+
+    def _view_names(self) -> list[str]:
+        return [*super()._view_names(), "target_actions", "exploratory_target_actions", "foreign", "off_route"]
+
+    def _position_arrays(self) -> list[np.ndarray]:
+        return [*super()._position_arrays(), self._mode_position]
 
     def _allocate(self) -> None:
         super()._allocate()
-        self.target_actions = np.zeros_like(self.actions)
-        self.exploratory_target_actions = np.zeros_like(self.actions)
-        self.foreign = np.zeros(self.buffer_size, dtype=bool)
-        self.off_route = np.zeros(self.buffer_size, dtype=bool)
+        self.target_actions = self._steps["target_actions"]
+        self.exploratory_target_actions = self._steps["exploratory_target_actions"]
+        self.foreign, self.off_route = self._notes["foreign"], self._notes["off_route"]
         self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
         for row_set in self.mode_rows:
             row_set.position = self._mode_position
 
     def _write_rows(self, rows: np.ndarray, obs: Any, next_obs: Any, action: np.ndarray, *args: Any) -> None:
         super()._write_rows(rows, obs, next_obs, action, *args)
-        self.target_actions[rows] = self.exploratory_target_actions[rows] = action
+        for name in ("target_actions", "exploratory_target_actions"):
+            self._steps.write(name, rows, action)
         self.foreign[rows] = self.off_route[rows] = False
+        self._last_positions = self.features(next_obs).copy()  # the environments may write into theirs
 
     def _evict(self) -> Trajectory:
         trajectory = super()._evict()
@@ -168,7 +185,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         """
         :return: Mode features of the states reached by the latest ``add``, shape [n_envs, dim]
         """
-        return self.features(self._read(self.next_observations, self._last_rows))
+        return self._last_positions
 
     def expect_modes(self, n_modes: int) -> None:
         """
@@ -233,16 +250,20 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param trajectory: A stored trajectory
         :return: Its mode features, terminal state included, shape [length + 1, dim]
         """
-        first = self.features(self._read(self.observations, trajectory.rows))
-        last = self.features(self._read(self.next_observations, trajectory.rows[-1:]))
+        first = self._positions(self._steps, "observations", trajectory.rows)
+        last = self._positions(self._nexts, "next_observations", trajectory.rows[-1:])
         return np.concatenate((first, last))
+
+    def _positions(self, part: Any, name: str, rows: np.ndarray) -> np.ndarray:
+        """Mode features at the rows, shape [N, dim]."""
+        return self.features.of_tensors(self._as_observation(part.tensors(rows), name)).cpu().numpy()
 
     def _measure_scale(self) -> np.ndarray:
         """Declared positions keep their unit; a whole observation is standardised once, or cached distances would age."""
         if not self.features.whole_observation:
             return np.ones(self.features.dim, dtype=np.float32)
         rows = self._all.rows[: min(self._all.size, 50_000)]
-        deviation = self.features(self._read(self.observations, rows)).std(axis=0)
+        deviation = self._positions(self._steps, "observations", rows).std(axis=0)
         return np.where(deviation > 1e-6, deviation, 1.0).astype(np.float32)
 
     def success_distances(self, successes: list[Trajectory]) -> np.ndarray:
@@ -348,7 +369,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         """Target actions are inherited with the critics that made them, or start again from the action."""
         inherited = trajectory.mode == NO_MODE or (mode != NO_MODE and parents[mode] == trajectory.mode)
         if not inherited:
-            self.target_actions[trajectory.rows] = self.actions[trajectory.rows]
+            self._steps.write("target_actions", trajectory.rows, self._steps.tensors(trajectory.rows)["actions"])
         trajectory.mode = mode
 
     # ------------------------------------------------------------------ sampling
@@ -373,31 +394,33 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         active = np.array([True, *(row_set.size > 0 for row_set in self.mode_rows)])
         sets = [self._all, *(row_set if row_set.size else self._all for row_set in self.mode_rows)]
         rows = np.stack([row_set.sample(n) for row_set in sets])  # [G, n]
-        windows = self._windows(rows, exploration_n_steps, mode_n_steps)
+        windows, notes = self._windows(rows, exploration_n_steps, mode_n_steps)
         present = windows >= 0
         powers = np.float32(gamma) ** np.arange(windows.shape[-1], dtype=np.float32)
-        rewards = self._normalize_reward(self.rewards.take(windows.ravel()), env).reshape(windows.shape)
+        rewards = self._normalize_reward(notes["rewards"].ravel(), env).reshape(windows.shape)
         # For its mode a step off the route ends the episode without reward, so that no way back is worth anything
-        lost = np.logical_or.accumulate(self.off_route.take(windows) & present, axis=-1)
+        lost = np.logical_or.accumulate(notes["off_route"] & present, axis=-1)
         lost[EXPLORATORY_GROUP] = False
         # What led away from the route is for the critic to judge, not for the policy to follow
-        imitated = active[:, None] & ~self.foreign.take(rows)
+        imitated = active[:, None] & ~notes["foreign"][..., 0]
         imitated[EXPLORATORY_GROUP] = True
         rewards = (np.where(present & ~lost, rewards, 0.0) * powers).sum(axis=-1)  # [G, n]
         lengths = present.sum(axis=-1)
-        last = np.take_along_axis(windows, lengths[..., None] - 1, axis=-1)[..., 0]
-        continues = (~self.dones.take(last) | self.timeouts.take(last)) & ~lost.any(axis=-1)
-        discounts = np.float32(gamma) ** lengths * continues
-        obs = self._normalize_obs(self._read(self.observations, rows.ravel()), env)
-        next_obs = self._normalize_obs(self._read(self.next_observations, last.ravel()), env)
-        targets = np.concatenate(
-            (self.exploratory_target_actions.take(rows[:1], axis=0), self.target_actions.take(rows[1:], axis=0))
+        ends = lengths[..., None] - 1
+        last = np.take_along_axis(windows, ends, axis=-1).ravel()
+        ended = np.take_along_axis(notes["dones"] & ~notes["timeouts"], ends, axis=-1)[..., 0]
+        discounts = np.float32(gamma) ** lengths * ~(ended | lost.any(axis=-1))
+        steps = self._on_device(self._steps.tensors(rows.ravel()))
+        nexts = self._on_device(self._nexts.tensors(last))
+        actions, exploratory, targets = (
+            steps[name].view(*rows.shape, self.action_dim)
+            for name in ("actions", "exploratory_target_actions", "target_actions")
         )
         return ModeBatch(
-            observations=self._tensors(obs),
-            actions=self.to_torch(self.actions.take(rows, axis=0)),
-            target_actions=self.to_torch(targets),
-            next_observations=self._tensors(next_obs),
+            observations=self.normalized(self._as_observation(steps, "observations"), env),
+            actions=actions,
+            target_actions=th.cat((exploratory[:1], targets[1:])),
+            next_observations=self.normalized(self._as_observation(nexts, "next_observations"), env),
             rewards=self.to_torch(rewards.astype(np.float32)),
             discounts=self.to_torch(discounts.astype(np.float32)),
             active=self.to_torch(active),
@@ -406,17 +429,16 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             windows=np.where(lost, -1, windows),
         )
 
-    def _windows(self, rows: np.ndarray, exploration_n_steps: int, mode_n_steps: int) -> np.ndarray:
-        """The rows that follow each row in its trajectory, itself first, [G, n, n_steps]; -1 beyond the end."""
+    def _windows(self, rows: np.ndarray, exploration_n_steps: int, mode_n_steps: int) -> tuple[np.ndarray, np.ndarray]:
+        """The rows that follow each row in its trajectory, itself first, -1 beyond its end; their notes. [G, n, n_steps]"""
         n_steps = max(exploration_n_steps, mode_n_steps if len(rows) > 1 else 1)
-        windows = np.full((*rows.shape, n_steps), -1, dtype=np.int32)
-        windows[..., 0] = rows
+        windows = np.empty((*rows.shape, n_steps), dtype=np.int32)
+        windows[..., 0], following = rows, rows
         for k in range(1, n_steps):
-            previous = windows[..., k - 1]
-            windows[..., k] = np.where(previous >= 0, self.next_row.take(previous), -1)
+            following = windows[..., k] = np.where(following >= 0, self.next_row[following], -1)
         windows[0, :, exploration_n_steps:] = -1
         windows[1:, :, mode_n_steps:] = -1
-        return windows
+        return windows, self._notes.take(windows)
 
     def store_target_actions(self, batch: ModeBatch, target_actions: th.Tensor) -> None:
         """
@@ -425,8 +447,10 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param batch: As drawn by ``sample_modes``
         :param target_actions: Shape [G, n, action_dim]
         """
-        improved = target_actions.cpu().numpy()
-        self.exploratory_target_actions[batch.rows[0]] = improved[0]
-        for mode, row_set in enumerate(self.mode_rows):
-            if row_set.size:
-                self.target_actions[batch.rows[mode + 1]] = improved[mode + 1]
+        if self.storage_device.type == "cpu":
+            target_actions = target_actions.cpu()
+        self._steps.write("exploratory_target_actions", batch.rows[0], target_actions[0])
+        groups = [mode + 1 for mode, row_set in enumerate(self.mode_rows) if row_set.size]
+        if groups:
+            improved = target_actions if len(groups) + 1 == len(target_actions) else target_actions[groups]
+            self._steps.write("target_actions", batch.rows[groups].ravel(), improved[-len(groups) :].flatten(0, 1))

@@ -1,9 +1,11 @@
 """Twin distributional critics of the exploratory group and of every mode, stacked in one set of tensors."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 
+import numpy as np
 import torch as th
 from torch import nn
 from torch.nn import functional as F
@@ -11,6 +13,8 @@ from torch.nn import functional as F
 # The projected distribution of the twin with the lower mean; or the element-wise minimum of all, with binary cross-entropy, as
 # in the authors' code
 TWIN_TARGETS = ("lower_mean", "elementwise")
+# Rows of a group from which on it pays on a processor to go back through the lower twin only
+LARGE_ASCENT = 256
 
 
 class ModeCritics(nn.Module):
@@ -101,16 +105,21 @@ class ModeCritics(nn.Module):
         :param frozen: Whether the weights are constants, which makes a gradient with respect to the actions cheaper
         :return: Logits over the atoms (values when scalar), shape [G, C, n, n_atoms]
         """
-        weights = [weight.detach() if frozen else weight for weight in self.weights]
-        biases = [bias.detach() if frozen else bias for bias in self.biases]
-        groups, rows = features.shape[:2]
-        n_nets = groups * self.n_critics
-        # [G, n, F + A] -> [G * C, n, F + A]
-        hidden = th.cat((features, actions), dim=2)[:, None].expand(-1, self.n_critics, -1, -1).reshape(n_nets, rows, -1)
-        hidden = th.baddbmm(biases[0].flatten(0, 1), hidden, weights[0].flatten(0, 1))
-        for weight, bias in zip(weights[1:], biases[1:], strict=True):
-            hidden = th.baddbmm(bias.flatten(0, 1), self.activation(hidden), weight.flatten(0, 1))
-        return hidden.unflatten(0, (groups, self.n_critics))
+        return self._layers(th.cat((features, actions), dim=2), self._stacked(frozen))[-1]
+
+    def _stacked(self, frozen: bool) -> list[tuple[th.Tensor, th.Tensor]]:
+        """Weights [G * C, in, out] and biases [G * C, 1, out] of all layers."""
+        layers = [[parameter.flatten(0, 1) for parameter in layer] for layer in zip(self.weights, self.biases, strict=True)]
+        return [(weight.detach(), bias.detach()) if frozen else (weight, bias) for weight, bias in layers]
+
+    def _layers(self, inputs: th.Tensor, parameters: list[tuple[th.Tensor, th.Tensor]]) -> list[th.Tensor]:
+        """What every layer gives before its activation, [G, C, n, width] each."""
+        layers: list[th.Tensor] = []
+        hidden = inputs[:, None].expand(-1, self.n_critics, -1, -1).flatten(0, 1)  # [G, n, in] -> [G * C, n, in]
+        for weight, bias in parameters:
+            layers.append(th.baddbmm(bias, hidden, weight))
+            hidden = self.activation(layers[-1]) if len(layers) < len(parameters) else hidden
+        return [layer.unflatten(0, (-1, self.n_critics)) for layer in layers]
 
     def values(self, logits: th.Tensor) -> th.Tensor:
         """
@@ -163,18 +172,57 @@ class ModeCritics(nn.Module):
             return errors.sum(dim=-1).mean(dim=2).sum(dim=1)
         return -(targets[:, None] * F.log_softmax(logits, dim=-1)).sum(dim=-1).mean(dim=2).sum(dim=1)
 
-    def action_gradient(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def action_gradient(self, features: th.Tensor) -> Callable[[th.Tensor], th.Tensor]:
         """
-        Gradient of min(Q1, Q2) with respect to each row's own action: it does not depend on the batch's size.
+        The gradient of min(Q1, Q2) with respect to each row's own action: it does not depend on the batch's size.
 
         :param features: Shape [G, n, F]
-        :param actions: Shape [G, n, A]
-        :return: Shape [G, n, A]
+        :return: The gradient as a function of the actions, [G, n, A] to [G, n, A]
         """
-        actions = actions.detach().requires_grad_()
-        with th.enable_grad():
-            value = self.values(self(features, actions, frozen=True)).min(dim=1).values.sum()
-        return th.autograd.grad(value, actions)[0]
+        (weight, bias), *others = self._stacked(frozen=True)
+        shared = features[:, None].expand(-1, self.n_critics, -1, -1).flatten(0, 1)
+        # The features' part of the first layer is the same at every step of an ascent
+        parameters = [(weight[:, self.features_dim :], th.baddbmm(bias, shared, weight[:, : self.features_dim])), *others]
+        if features.device.type == "cpu" and features.shape[1] >= LARGE_ASCENT:
+            return partial(self._lower_twin_gradient, parameters)
+
+        def gradient(actions: th.Tensor) -> th.Tensor:
+            actions = actions.detach().requires_grad_()
+            with th.enable_grad():
+                value = self.values(self._layers(actions, parameters)[-1]).min(dim=1).values.sum()
+            return th.autograd.grad(value, actions)[0]
+
+        return gradient
+
+    @th.no_grad()
+    def _lower_twin_gradient(self, parameters: list[tuple[th.Tensor, th.Tensor]], actions: th.Tensor) -> th.Tensor:
+        """
+        The same, going back through the lower twin of each row only: half the products, but the rows must be sorted by twin,
+        which takes many small operations, and on an accelerator would wait for it.
+        """
+        *hidden, logits = self._layers(actions, parameters)
+        lower_twin = self.values(logits).min(dim=1).indices  # [G, n]
+        gradient = th.empty_like(actions)
+        for group, twin in np.ndindex(*logits.shape[:2]):
+            rows = (lower_twin[group] == twin).nonzero().squeeze(1)
+            net = group * self.n_critics + twin
+            # Of the expected value with respect to the logits: p (z - E z); of a scalar value: 1
+            backward = logits.new_ones(len(rows), 1)
+            if self.n_atoms > 1:
+                atoms = self.atoms[min(group, 1)]
+                probabilities = logits[group, twin].index_select(0, rows).softmax(dim=-1)
+                backward = probabilities * (atoms - (probabilities @ atoms)[:, None])
+            for layer in range(len(hidden), 0, -1):
+                backward = backward @ parameters[layer][0][net].T
+                before = hidden[layer - 1][group, twin].index_select(0, rows)
+                if type(self.activation) is nn.ELU and self.activation.alpha == 1.0:
+                    backward = backward.mul_(before.clamp_(max=0.0).exp_())  # its derivative, at half autograd's price
+                else:
+                    before.requires_grad_()
+                    with th.enable_grad():
+                        backward = th.autograd.grad(self.activation(before), before, backward)[0]
+            gradient[group].index_copy_(0, rows, backward @ parameters[0][0][net].T)
+        return gradient
 
     @th.no_grad()
     def inherit(

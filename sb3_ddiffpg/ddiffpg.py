@@ -18,8 +18,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TensorDict
-from stable_baselines3.common.utils import FloatSchedule, polyak_update, update_learning_rate
+from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, Behavior
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
@@ -415,24 +416,18 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
             reward = (reward / (self.intrinsic_moments.var.sqrt() + 1e-8)).clamp(max=10.0)
         if self.novelty_model.optimizer is not None:
             metrics["novelty_loss"].append(self.novelty_model.update(*inputs[1]))
-        rewards = reward.new_zeros(windows.shape)
-        rewards[th.as_tensor(present, device=self.device)] = reward
+        places = th.from_numpy(np.flatnonzero(present)).to(self.device, non_blocking=True)
+        rewards = reward.new_zeros(windows.size).index_copy(0, places, reward).view(windows.shape)
         discounts = self.gamma ** th.arange(windows.shape[-1], device=self.device)
         return self.intrinsic_coef * (rewards * discounts).sum(dim=-1).float()
 
     def _novelty_inputs(self, obs: Any) -> tuple[th.Tensor, th.Tensor]:
-        """Positions [N, position_dim] and scaled features [N, features_dim] of raw observations."""
-        positions = th.as_tensor(self.replay_buffer.features(obs), device=self.device)
+        """Positions [N, position_dim] and scaled features [N, features_dim] of observations, not normalised, on the device."""
+        positions = self.replay_buffer.features.of_tensors(obs)
         if not getattr(self.novelty_model, "with_observation", False):
             return positions, positions
-        if self._vec_normalize_env is not None:
-            obs = self._vec_normalize_env.normalize_obs(obs)
+        obs = self.replay_buffer.normalized(obs, self._vec_normalize_env)
         with th.no_grad():
-            obs = (
-                {key: th.as_tensor(value, device=self.device) for key, value in obs.items()}
-                if isinstance(obs, dict)
-                else (th.as_tensor(obs, device=self.device))
-            )
             return positions, self.actor.extract_features(obs, self.actor.features_extractor)
 
     def _row_embeddings(self, batch: ModeBatch, masked: bool) -> th.Tensor:
@@ -468,7 +463,7 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         with th.no_grad():
             features = self.policy.critic_features(batch.observations)
         target_actions = ascend(
-            lambda actions: self.policy.critics.action_gradient(features, actions),
+            self.policy.critics.action_gradient(features),
             batch.target_actions,
             learning_rate=self.action_lr,
             n_steps=self.n_action_gradient_steps,
@@ -489,14 +484,14 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
 
     def _update_targets(self) -> None:
         policy = self.policy
-        polyak_update(policy.critics.parameters(), policy.critics_target.parameters(), self.tau)
-        polyak_update(
-            policy.critic_features_extractor.parameters(), policy.critic_features_extractor_target.parameters(), self.tau
-        )
+        online = [*policy.critics.parameters(), *policy.critic_features_extractor.parameters()]
+        targets = [*policy.critics_target.parameters(), *policy.critic_features_extractor_target.parameters()]
+        # Polyak averaging, in one kernel
+        get_ema_multi_avg_fn(1 - self.tau)(targets, online, None)
         # Running statistics of a batch norm are copied, as in SB3
         statistics = policy.critic_features_extractor.buffers(), policy.critic_features_extractor_target.buffers()
-        for online, target in zip(*statistics, strict=True):
-            target.copy_(online)
+        for current, target in zip(*statistics, strict=True):
+            target.copy_(current)
 
     def _update_learning_rates(self) -> None:
         progress = self._current_progress_remaining

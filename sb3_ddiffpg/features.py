@@ -145,11 +145,25 @@ class ModeFeatures:
         :return: Shape [N, dim], float32
         """
         if callable(self.selection):
-            features = np.asarray(self.selection(observations))
-        elif isinstance(observations, dict):
+            return np.asarray(self.selection(observations)).astype(np.float32)
+        if isinstance(observations, dict):
+            return self.of_tensors({key: th.as_tensor(value) for key, value in observations.items()}).numpy()
+        return self.of_tensors(th.as_tensor(observations)).numpy()
+
+    def of_tensors(self, observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor:
+        """
+        The same for tensors, on their device. A callable selects in the main memory.
+
+        :param observations: Batch of N observations
+        :return: Shape [N, dim], float32
+        """
+        if callable(self.selection):
+            if isinstance(observations, dict):
+                device = next(iter(observations.values())).device
+                return th.from_numpy(self({key: value.cpu().numpy() for key, value in observations.items()})).to(device)
+            return th.from_numpy(self(observations.cpu().numpy())).to(observations.device)
+        if isinstance(observations, dict):
             keys = sorted(observations) if self.selection is None else [self.selection]
-            features = np.concatenate([observations[key].reshape(len(observations[key]), -1) for key in keys], axis=1)
-        else:
-            flat = observations.reshape(len(observations), -1)
-            features = flat if self.selection is None else flat[:, self.selection]
-        return features.astype(np.float32)
+            return th.cat([observations[key].reshape(len(observations[key]), -1).float() for key in keys], dim=1)
+        flat = observations.reshape(len(observations), -1)
+        return (flat if self.selection is None else flat[:, self.selection]).float()

@@ -89,7 +89,7 @@ class RandomNetworkDistillation(nn.Module):
         self.target = self._network(size, net_arch)
         self.predictor = self._network(size, net_arch)
         self.target.requires_grad_(False)
-        self.optimizer = th.optim.Adam(self.predictor.parameters(), lr=learning_rate)
+        self.optimizer = th.optim.Adam(self.predictor.parameters(), lr=learning_rate, fused=True)
 
     @staticmethod
     def _network(size: int, net_arch: tuple[int, ...]) -> nn.Sequential:

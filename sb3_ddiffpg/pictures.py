@@ -62,4 +62,4 @@ def _places(model: Any, maze: Any, observation: np.ndarray | None) -> np.ndarray
     if not buffer.size():
         return None
     rows = np.random.default_rng(0).choice(buffer._all.rows[: buffer.size()], size=2000)
-    return buffer.read_observations(rows)[0]
+    return buffer.read_observations(rows)[0].cpu().numpy()

@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples, Repla
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.features import Observation
+from sb3_ddiffpg.row_storage import Fields, HostRows, make_rows
 from sb3_ddiffpg.trajectories import NO_MODE, RowSet, SuccessRule, Trajectory
 
 
@@ -20,7 +21,8 @@ class TrajectoryReplayBuffer(ReplayBuffer):
     Transitions live in rows; a finished trajectory owns its rows. When rows run out, the oldest retired trajectory is evicted,
     then the oldest of whichever group (mode and outcome) holds most rows, so that a rare mode is never crowded out.
 
-    Storage is allocated at the first ``add``: a model that is loaded to act needs none.
+    Storage is allocated at the first ``add``: a model that is loaded to act needs none. What the networks see may live on an
+    accelerator (``storage_device``); what decides which rows are read always stays in the main memory.
 
     :param buffer_size: Capacity in transitions (over all environments)
     :param observation_space: Observation space
@@ -31,11 +33,17 @@ class TrajectoryReplayBuffer(ReplayBuffer):
     :param handle_timeout_termination: Whether time limits are bootstrapped through
     :param success_key: Key of ``info`` that marks a success; None reads ``is_success`` or ``success`` and, where neither
         exists, counts the trajectories whose return is in the top fifth of those seen lately
+    :param storage_device: Where observations and actions live: ``"cpu"``, or ``"cuda"`` where its memory holds them
     :raises ValueError: If ``buffer_size`` is not positive or ``optimize_memory_usage`` is asked for
     """
 
+    # Views of the storage: arrays (tensors where it is on an accelerator), or dicts of such
     observations: Any
     next_observations: Any
+    actions: Any
+    rewards: np.ndarray
+    dones: np.ndarray
+    timeouts: np.ndarray
     next_row: np.ndarray
 
     def __init__(
@@ -48,6 +56,7 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         optimize_memory_usage: bool = False,
         handle_timeout_termination: bool = True,
         success_key: str | None = None,
+        storage_device: th.device | str = "cpu",
     ) -> None:
         if optimize_memory_usage:
             raise ValueError("optimize_memory_usage=True is not supported: trajectories do not lie in one ring")
@@ -58,6 +67,7 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         self.optimize_memory_usage = False
         self.handle_timeout_termination = handle_timeout_termination
         self.success_key = success_key
+        self.storage_device = th.device(storage_device)
         self.reset()
 
     def reset(self) -> None:
@@ -79,56 +89,78 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         self._success_rule = SuccessRule(self.success_key)
         self.just_finished: list[tuple[int, Trajectory]] = []
 
-    def _row_arrays(self) -> list[str]:
-        return ["observations", "next_observations", "actions", "rewards", "dones", "timeouts", "next_row", "_all_position"]
+    def _observation_fields(self, name: str) -> Fields:
+        space = self.observation_space
+        parts = {f"{name}/{key}": each for key, each in space.items()} if isinstance(space, spaces.Dict) else {name: space}
+        fields: Fields = {}
+        for part, each in parts.items():
+            shape: Any = get_obs_shape(each)
+            fields[part] = shape, self._maybe_cast_dtype(each.dtype)
+        return fields
+
+    def _step_fields(self) -> Fields:
+        """What is read at the row of a step."""
+        return {**self._observation_fields("observations"), "actions": ((self.action_dim,), np.float32)}
+
+    def _note_fields(self) -> Fields:
+        """What is read at all rows of a window."""
+        return {"rewards": ((), np.float32), "next_row": ((), np.int32), "dones": ((), bool), "timeouts": ((), bool)}
 
     def _allocate(self) -> None:
-        """The operating system commits zeroed pages only when they are written, so an unfilled buffer stays small."""
-
-        def zeros_like_space(space: spaces.Space) -> np.ndarray:
-            shape = get_obs_shape(space)
-            return np.zeros((self.buffer_size, *shape), dtype=self._maybe_cast_dtype(space.dtype))
-
-        if isinstance(self.observation_space, spaces.Dict):
-            self.observations = {key: zeros_like_space(space) for key, space in self.observation_space.items()}
-            self.next_observations = {key: zeros_like_space(space) for key, space in self.observation_space.items()}
-        else:
-            self.observations = zeros_like_space(self.observation_space)
-            self.next_observations = zeros_like_space(self.observation_space)
-        self.actions = np.zeros((self.buffer_size, self.action_dim), dtype=np.float32)
-        self.rewards = np.zeros(self.buffer_size, dtype=np.float32)
-        self.dones = np.zeros(self.buffer_size, dtype=bool)
-        self.timeouts = np.zeros(self.buffer_size, dtype=bool)
-        self.next_row = np.zeros(self.buffer_size, dtype=np.int32)
+        self._steps = make_rows(self.buffer_size, self._step_fields(), self.storage_device)
+        self._nexts = make_rows(self.buffer_size, self._observation_fields("next_observations"), self.storage_device)
+        self._notes = HostRows(self.buffer_size, self._note_fields())
+        self.observations = self._as_observation(self._steps, "observations")
+        self.next_observations = self._as_observation(self._nexts, "next_observations")
+        self.actions = self._steps["actions"]
+        self.rewards, self.next_row = self._notes["rewards"], self._notes["next_row"]
+        self.dones, self.timeouts = self._notes["dones"], self._notes["timeouts"]
         self._all_position = np.zeros(self.buffer_size, dtype=np.int32)
         self._all = RowSet(self._all_position)
         self._allocated = True
+
+    def _as_observation(self, fields: Any, name: str) -> Any:
+        """One array or tensor, or a dict of them."""
+        if isinstance(self.observation_space, spaces.Dict):
+            return {key: fields[f"{name}/{key}"] for key in self.observation_space.spaces}
+        return fields[name]
+
+    @property
+    def storage_bytes(self) -> int:
+        """Size of the storage."""
+        return sum(part.nbytes for part in (self._steps, self._nexts, self._notes, *self._position_arrays()))
+
+    def _position_arrays(self) -> list[np.ndarray]:
+        return [self._all_position]
+
+    def _stored(self) -> tuple[Any, ...]:
+        return self._steps, self._nexts, self._notes
 
     def __getstate__(self) -> dict[str, Any]:
         """Only used rows are pickled."""
         state = self.__dict__.copy()
         if self._allocated:
-            for name in self._row_arrays():
-                array = state[name]
-                used = {k: v[: self.pos] for k, v in array.items()} if isinstance(array, dict) else array[: self.pos]
-                state[name] = used
+            own = [*self._stored(), *self._position_arrays()]
+            views = {*(id(value) for value in own), *(id(getattr(self, name)) for name in self._view_names())}
+            state = {name: value for name, value in state.items() if id(value) not in views}
+            state["saved_rows"] = [part.dump(self.pos) for part in self._stored()]
+            state["saved_positions"] = [array[: self.pos] for array in self._position_arrays()]
         return state
 
+    def _view_names(self) -> list[str]:
+        return ["observations", "next_observations", "actions", "rewards", "next_row", "dones", "timeouts"]
+
     def __setstate__(self, state: dict[str, Any]) -> None:
+        saved_rows, saved_positions = state.pop("saved_rows", None), state.pop("saved_positions", None)
         self.__dict__.update(state)
         if not self._allocated:
             return
-        saved = {name: state[name] for name in self._row_arrays()}
         all_rows = self._all
         self._allocate()
-        for name, array in saved.items():
-            target = getattr(self, name)
-            for full, used in zip(
-                target.values() if isinstance(target, dict) else [target],
-                array.values() if isinstance(array, dict) else [array],
-                strict=True,
-            ):
-                full[: self.pos] = used
+        for part, records in zip(self._stored(), saved_rows, strict=True):
+            part.restore(records)
+        for array, used in zip(self._position_arrays(), saved_positions, strict=True):
+            array[: self.pos] = used
         self._all = all_rows
         self._all.position = self._all_position
 
@@ -224,21 +256,19 @@ class TrajectoryReplayBuffer(ReplayBuffer):
     def _write_rows(
         self, rows: np.ndarray, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray, done: np.ndarray
     ) -> None:
-        self._write(self.observations, rows, obs)
-        self._write(self.next_observations, rows, next_obs)
-        self.actions[rows] = action
+        self._write_observations(self._steps, "observations", rows, obs)
+        self._write_observations(self._nexts, "next_observations", rows, next_obs)
+        self._steps.write("actions", rows, action)
         self.rewards[rows] = reward
         self.dones[rows] = done
         self.timeouts[rows] = False
         self.next_row[rows] = -1
 
     @staticmethod
-    def _write(array: Any, rows: np.ndarray, value: Any) -> None:
-        if isinstance(array, dict):
-            for key in array:
-                array[key][rows] = np.asarray(value[key]).reshape(len(rows), *array[key].shape[1:])
-        else:
-            array[rows] = np.asarray(value).reshape(len(rows), *array.shape[1:])
+    def _write_observations(part: Any, name: str, rows: np.ndarray, value: Any) -> None:
+        values = {f"{name}/{key}": each for key, each in value.items()} if isinstance(value, dict) else {name: value}
+        for field, each in values.items():
+            part.write(field, rows, np.asarray(each).reshape(len(rows), *part[field].shape[1:]))
 
     @staticmethod
     def check_finite(name: str, value: Any) -> None:
@@ -295,25 +325,32 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         found = [t for key, group in self._groups.items() if key[1] == success for t in group]
         return sorted(found, key=lambda trajectory: trajectory.serial)
 
-    def _read(self, array: Any, rows: np.ndarray) -> Any:
-        # Not array[rows]: in a large buffer `take` is three times as fast
-        return (
-            {key: value.take(rows, axis=0) for key, value in array.items()}
-            if isinstance(array, dict)
-            else array.take(rows, axis=0)
-        )
-
-    def read_observations(self, rows: np.ndarray, env: VecNormalize | None = None) -> tuple[Any, Any]:
+    def read_observations(self, rows: np.ndarray) -> tuple[Any, Any]:
         """
         :param rows: Shape [N]
-        :param env: Normalises the observations when given
-        :return: Observations and next observations of the rows, unprocessed NumPy arrays or dicts of such
+        :return: Observations and next observations of the rows, not normalised: tensors [N, ...] or dicts of such
         """
-        obs, next_obs = self._read(self.observations, rows), self._read(self.next_observations, rows)
-        return self._normalize_obs(obs, env), self._normalize_obs(next_obs, env)
+        return (
+            self._as_observation(self._on_device(self._steps.tensors(rows)), "observations"),
+            self._as_observation(self._on_device(self._nexts.tensors(rows)), "next_observations"),
+        )
 
-    def _tensors(self, obs: Any) -> Any:
-        return {key: self.to_torch(value) for key, value in obs.items()} if isinstance(obs, dict) else self.to_torch(obs)
+    def _on_device(self, fields: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
+        return {name: value.to(self.device, non_blocking=True) for name, value in fields.items()}
+
+    def normalized(self, obs: Any, env: VecNormalize | None) -> Any:
+        """
+        :param obs: Tensors of observations, or a dict of such
+        :param env: Normalises them, in the main memory, when given
+        :return: What the networks see of them
+        """
+        if env is None:
+            return obs
+        host = {key: each.cpu().numpy() for key, each in obs.items()} if isinstance(obs, dict) else obs.cpu().numpy()
+        normalized: Any = self._normalize_obs(host, env)
+        if isinstance(normalized, dict):
+            return {key: self.to_torch(value) for key, value in normalized.items()}
+        return self.to_torch(normalized)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """
@@ -324,13 +361,14 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         :return: SB3's samples
         """
         rows = self._all.sample(batch_size)
-        obs, next_obs = self.read_observations(rows, env)
+        steps = self._on_device(self._steps.tensors(rows))
+        nexts = self._on_device(self._nexts.tensors(rows))
         dones = (self.dones[rows] & ~self.timeouts[rows]).astype(np.float32)
         samples = DictReplayBufferSamples if isinstance(self.observation_space, spaces.Dict) else ReplayBufferSamples
         return samples(  # type: ignore[return-value]
-            observations=self._tensors(obs),
-            actions=self.to_torch(self.actions[rows]),
-            next_observations=self._tensors(next_obs),
+            observations=self.normalized(self._as_observation(steps, "observations"), env),
+            actions=steps["actions"],
+            next_observations=self.normalized(self._as_observation(nexts, "next_observations"), env),
             dones=self.to_torch(dones[:, None]),
             rewards=self.to_torch(self._normalize_reward(self.rewards[rows, None], env)),
         )

@@ -133,22 +133,26 @@ def test_values_start_near_zero():
     assert values[1:].max() < 1.0 and values[1:].min() >= 0.0
 
 
-def test_action_gradient_equals_finite_differences_and_ignores_the_batch():
+@pytest.mark.parametrize("n_atoms", [51, 1])
+@pytest.mark.parametrize("activation_fn", [th.nn.SiLU, th.nn.ELU])
+@pytest.mark.parametrize("large", [0, 1000])  # both ways to compute it
+def test_action_gradient_equals_finite_differences_and_ignores_the_batch(monkeypatch, large, activation_fn, n_atoms):
+    monkeypatch.setattr("sb3_ddiffpg.critics.LARGE_ASCENT", large)
     th.manual_seed(0)
-    critics = ModeCritics(3, 2, [16, 16], n_groups=2).double()
+    critics = ModeCritics(3, 2, [16, 16], n_groups=2, activation_fn=activation_fn, n_atoms=n_atoms).double()
     th.nn.init.normal_(critics.weights[-1])
     features, actions = th.randn(2, 6, 3).double(), (th.rand(2, 6, 2) - 0.5).double()
 
     def value(at):
         return critics.values(critics(features, at)).min(dim=1).values
 
-    gradient = critics.action_gradient(features, actions)
+    gradient = critics.action_gradient(features)(actions)
     for dim in range(2):
         shift = th.zeros(2).double()
         shift[dim] = 1e-6
         numeric = (value(actions + shift) - value(actions - shift)) / 2e-6
         th.testing.assert_close(gradient[..., dim], numeric, rtol=1e-4, atol=1e-6)
-    alone = critics.action_gradient(features[:, :1], actions[:, :1])
+    alone = critics.action_gradient(features[:, :1])(actions[:, :1])
     th.testing.assert_close(alone, gradient[:, :1])
 
 

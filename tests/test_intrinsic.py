@@ -148,7 +148,7 @@ def slow_intrinsic_reward(model, window, scale=1.0):
     total = 0.0
     for k, row in enumerate(window[window >= 0]):
         now, then = (
-            model.novelty_model.novelty(*model._novelty_inputs(obs[row : row + 1])).item()
+            model.novelty_model.novelty(*model._novelty_inputs(th.from_numpy(obs[row : row + 1]))).item()
             for obs in (model.replay_buffer.observations, model.replay_buffer.next_observations)
         )
         total += model.gamma**k * min(max(then - model.novelty_scale * now, 0.0) / scale, 10.0)

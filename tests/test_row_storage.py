@@ -1,0 +1,113 @@
+"""Rows in the main memory and on an accelerator hold the same; an update on the latter never waits for it."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch as th
+from environments import AnySpaces, TwoEnds, assert_same_state, image_dict_space, small_model, state_of
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sb3_ddiffpg.row_storage import DeviceRows, HostRows
+
+FIELDS = {
+    "image": ((1, 3, 3), np.uint8),
+    "observation": ((5,), np.float32),
+    "flag": ((), bool),
+    "number": ((1,), np.int64),
+    "reward": ((), np.float32),
+}
+# What an accelerator does is here done by the processor, through the same code
+ON_DEVICE = partial(DeviceRows, device=th.device("cpu"))
+
+
+@pytest.fixture
+def stored_on_device(monkeypatch):
+    monkeypatch.setattr("sb3_ddiffpg.trajectory_buffer.make_rows", lambda n_rows, fields, device: ON_DEVICE(n_rows, fields))
+
+
+@pytest.mark.parametrize("make", [HostRows, ON_DEVICE])
+@settings(max_examples=25, deadline=None)
+@given(writes=st.lists(st.lists(st.integers(0, 19), min_size=1, max_size=6, unique=True), max_size=5), seed=st.integers(0, 99))
+def test_holds_what_one_array_for_each_field_would(make, writes, seed):
+    rng = np.random.default_rng(seed)
+    rows = make(20, FIELDS)
+    plain = {name: np.zeros((20, *shape), dtype) for name, (shape, dtype) in FIELDS.items()}
+    for places in writes:
+        for name, (shape, dtype) in FIELDS.items():
+            values = (200 * rng.random((len(places), *shape))).astype(dtype)
+            rows.write(name, np.array(places), values)
+            plain[name][places] = values
+    asked = rng.integers(0, 20, size=30)
+    restored = make(20, FIELDS)
+    restored.restore(rows.dump(15))
+    for name, column in plain.items():
+        np.testing.assert_array_equal(rows.tensors(asked)[name].numpy(), column[asked])
+        np.testing.assert_array_equal(np.asarray(rows[name]), column)
+        np.testing.assert_array_equal(np.asarray(restored[name])[:15], column[:15])
+        assert not np.asarray(restored[name])[15:].any()
+
+
+def trained(env):
+    model = small_model(env, seed=3, learning_starts=20, mode_intrinsic_coef=0.2, novelty="rnd")
+    model.learn(200)
+    return model
+
+
+@pytest.mark.parametrize("make_env", [lambda: DummyVecEnv([TwoEnds] * 4), lambda: VecNormalize(DummyVecEnv([TwoEnds] * 4))])
+def test_training_is_the_same_wherever_the_rows_are(make_env, monkeypatch):
+    on_host = trained(make_env())
+    monkeypatch.setattr("sb3_ddiffpg.trajectory_buffer.make_rows", lambda n_rows, fields, device: ON_DEVICE(n_rows, fields))
+    on_device = trained(make_env())
+    assert len(on_host.modes) >= 1 and isinstance(on_device.replay_buffer._steps, DeviceRows)
+    assert_same_state(state_of(on_host), state_of(on_device))
+    np.testing.assert_array_equal(on_host.replay_buffer.target_actions, on_device.replay_buffer.target_actions.numpy())
+
+
+@pytest.mark.parametrize("space", [image_dict_space(), spaces.Box(0, 255, (1, 36, 36), dtype=np.uint8), spaces.Discrete(5)])
+def test_other_observations_on_a_device(space, stored_on_device, tmp_path):
+    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
+    model = small_model(DummyVecEnv([lambda: AnySpaces(space)]), policy, learning_starts=10, v_min=-10.0, v_max=10.0)
+    model.learn(25)
+    model.save_replay_buffer(tmp_path / "buffer")
+    model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer.size() == 28
+
+
+class NoWaiting(TorchDispatchMode):
+    """Refuses what makes the main processor wait for an accelerator's result."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        name = function.name()
+        if name in ("aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "aten::unique"):
+            raise AssertionError(f"{name} waits for the device")
+        if name in ("aten::index.Tensor", "aten::index_put_", "aten::index_put"):
+            assert not any(each is not None and each.dtype == th.bool for each in args[1]), f"{name} by a mask waits"
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("settings", [{"novelty": "rnd"}, {"novelty": "counts"}, {"n_atoms": 1, "mode_intrinsic_coef": 0.3}])
+def test_an_update_never_waits_for_the_device(settings, stored_on_device, monkeypatch):
+    model = small_model(DummyVecEnv([TwoEnds] * 4), learning_starts=20, **settings)
+    model.learn(200)
+    assert len(model.modes) >= 1
+
+    def refuse(*_, **__):
+        raise AssertionError("this waits for the device")
+
+    monkeypatch.setattr("sb3_ddiffpg.critics.LARGE_ASCENT", 10**9)
+    model.replay_buffer.storage_device = th.device("cuda")  # only asked whether target actions must come back
+    metrics = {name: [] for name in ("intrinsic_reward", "novelty_loss")}
+    batch = model.replay_buffer.sample_modes(48, model.gamma, 3, 5)
+    for method in ("cpu", "numpy", "item", "tolist", "__bool__", "__float__", "__int__"):
+        monkeypatch.setattr(th.Tensor, method, refuse)
+    with NoWaiting():
+        rewards = model._rewards(batch, metrics)
+        model._update_critics(batch, rewards)
+        improved = model._improve_target_actions(batch)
+        model._update_actor(batch, improved)
+        model._update_targets()
