@@ -153,6 +153,8 @@ class TrajectoryReplayBuffer(ReplayBuffer):
     def __setstate__(self, state: dict[str, Any]) -> None:
         saved_rows, saved_positions = state.pop("saved_rows", None), state.pop("saved_positions", None)
         self.__dict__.update(state)
+        if self.storage_device.type == "cuda" and not th.cuda.is_available():
+            self.storage_device = th.device("cpu")  # saved on a larger machine
         if not self._allocated:
             return
         all_rows = self._all

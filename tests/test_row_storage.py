@@ -78,6 +78,16 @@ def test_other_observations_on_a_device(space, stored_on_device, tmp_path):
     assert model.replay_buffer.size() == 28
 
 
+def test_a_buffer_of_a_machine_with_an_accelerator_loads_without(tmp_path):
+    model = small_model(DummyVecEnv([TwoEnds] * 4), learning_starts=20)
+    model.learn(100)
+    model.replay_buffer.storage_device = th.device("cuda")
+    model.save_replay_buffer(tmp_path / "buffer")
+    if not th.cuda.is_available():
+        model.load_replay_buffer(tmp_path / "buffer")
+        assert isinstance(model.replay_buffer._steps, HostRows) and model.replay_buffer.size() >= 100
+
+
 class NoWaiting(TorchDispatchMode):
     """Refuses what makes the main processor wait for an accelerator's result."""
 

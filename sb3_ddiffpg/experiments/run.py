@@ -43,7 +43,11 @@ class CurveCallback(EvaluateModesCallback):
     def __init__(self, folder: Path, **kwargs: Any) -> None:
         super().__init__(path=folder / "logs" / "evaluations.jsonl", best_model_path=folder / "model.zip", **kwargs)
         self.folder = folder
-        self._started = time.perf_counter()
+        self._started, self._cpu = time.perf_counter(), time.process_time()
+
+    def _on_training_end(self) -> None:
+        if not self.evaluations or self.evaluations[-1][0] < self.num_timesteps:
+            self._on_period()
 
     def _on_period(self) -> None:
         super()._on_period()
@@ -51,6 +55,7 @@ class CurveCallback(EvaluateModesCallback):
         row: dict[str, Any] = {
             "step": step,
             "hours": round((time.perf_counter() - self._started) / 3600, 4),
+            "cpu_hours": round((time.process_time() - self._cpu) / 3600, 4),
             "updates": self.model._n_updates,
             "modes": len(getattr(self.model, "modes", ())),
             "commanded_modes": round(found.commanded_modes, 3),

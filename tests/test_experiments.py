@@ -1,0 +1,50 @@
+"""A recorded run says what it did, and can be done again."""
+
+import csv
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.evaluation import ModeEvaluation
+from sb3_ddiffpg.experiments import run as runs
+
+SMALL = "{n_timesteps: 1600, learning_starts: 320, n_envs: 4, policy_kwargs: 'dict(net_arch=[16])'}"
+
+
+def record(monkeypatch, folder, *arguments):
+    monkeypatch.setattr(runs, "N_TESTS", 3)
+    monkeypatch.setattr(runs, "N_TEST_EPISODES", 2)
+    monkeypatch.setattr(runs, "N_EPISODES", 3)
+    monkeypatch.setattr(sys, "argv", ["run", *arguments, "--out", str(folder)])
+    runs.main()
+    return yaml.safe_load((folder / "config.yml").read_text())
+
+
+def test_a_run_leaves_its_record_and_can_be_repeated(monkeypatch, tmp_path):
+    first = record(monkeypatch, tmp_path / "a", "--env", "PointMazeV1-v0", "--seed", "5", "--override", SMALL)
+    assert (first["env"], first["seed"], first["hyperparams"]["n_envs"]) == ("PointMazeV1-v0", 5, 4)
+    assert first["result"]["steps"] == 1600 and first["versions"]["torch"] and first["machine"]["cores"] >= 1
+    with (tmp_path / "a" / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["step"]) for row in rows] == sorted(int(row["step"]) for row in rows) and len(rows) == 3
+    assert {"0:-", "0:a", "hours", "commanded_modes"} <= set(rows[0])
+    assert first["result"]["best_step"] in [int(row["step"]) for row in rows]
+    evaluation = ModeEvaluation.load(tmp_path / "a" / "evaluation.json")
+    assert evaluation.start_spread == 0.0 and evaluation.uncommanded.n_episodes == 6
+    second = record(monkeypatch, tmp_path / "b", "--again", str(tmp_path / "a"))
+    assert second["hyperparams"] == first["hyperparams"]
+    models = [DDiffPG.load(tmp_path / name / "model.zip") for name in "ab"]
+    for mine, other in zip(*(model.policy.parameters() for model in models), strict=True):
+        np.testing.assert_array_equal(mine.detach().numpy(), other.detach().numpy())
+    with pytest.raises(SystemExit, match="holds a run already"):
+        record(monkeypatch, tmp_path / "a", "--again", str(tmp_path / "b"))
+
+
+def test_settings_that_do_not_exist(monkeypatch, tmp_path):
+    with pytest.raises(SystemExit, match="PointMazeV9-v0.*PointMazeV1-v0"):
+        record(monkeypatch, tmp_path, "--env", "PointMazeV9-v0")
+    with pytest.raises(SystemExit, match="--env or --again"):
+        record(monkeypatch, tmp_path)
