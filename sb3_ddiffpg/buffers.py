@@ -24,7 +24,8 @@ class ModeBatch(NamedTuple):
     Observations are [N, ...] (or dicts of such), ``actions``, ``target_actions`` [G, n, action_dim], ``rewards`` and
     ``discounts`` [G, n]. ``active`` [G] is False for a mode without any transition, whose rows are a stand-in that must
     not train it. ``imitated`` [G, n] is False for these and for steps of foreign trajectories, which the policy must not
-    learn. ``rows`` [G, n] and ``windows`` [G, n, n_steps] (-1 where a window ends early, or beyond the mode's route) say where
+    learn. ``new_ways`` [n] are the exploratory group's returns from goals reached by ways of which a mode has not its fill.
+    ``rows`` [G, n] and ``windows`` [G, n, n_steps] (-1 where a window ends early, or beyond the mode's route) say where
     in the buffer the transitions lie.
     """
 
@@ -36,6 +37,7 @@ class ModeBatch(NamedTuple):
     discounts: th.Tensor
     active: th.Tensor
     imitated: th.Tensor
+    new_ways: th.Tensor
     rows: np.ndarray
     windows: np.ndarray
 
@@ -78,6 +80,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     exploratory_target_actions: Any
     foreign: np.ndarray
     off_route: np.ndarray
+    way_novelty: np.ndarray
 
     def __init__(
         self,
@@ -149,10 +152,10 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         return {**super()._step_fields(), "target_actions": action, "exploratory_target_actions": action}
 
     def _note_fields(self) -> Fields:
-        return {**super()._note_fields(), "foreign": ((), bool), "off_route": ((), bool)}
+        return {**super()._note_fields(), "foreign": ((), bool), "off_route": ((), bool), "way_novelty": ((), np.float32)}
 
     def _view_names(self) -> list[str]:
-        return [*super()._view_names(), "target_actions", "exploratory_target_actions", "foreign", "off_route"]
+        return [*super()._view_names(), "target_actions", "exploratory_target_actions", "foreign", "off_route", "way_novelty"]
 
     def _position_arrays(self) -> list[np.ndarray]:
         return [*super()._position_arrays(), self._mode_position]
@@ -162,6 +165,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.target_actions = self._steps["target_actions"]
         self.exploratory_target_actions = self._steps["exploratory_target_actions"]
         self.foreign, self.off_route = self._notes["foreign"], self._notes["off_route"]
+        self.way_novelty = self._notes["way_novelty"]
         self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
         for row_set in self.mode_rows:
             row_set.position = self._mode_position
@@ -171,6 +175,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         for name in ("target_actions", "exploratory_target_actions"):
             self._steps.write(name, rows, action)
         self.foreign[rows] = self.off_route[rows] = False
+        self.way_novelty[rows] = 0.0
         self._last_positions = self.features(next_obs).copy()  # the environments may write into theirs
 
     def _evict(self) -> Trajectory:
@@ -314,8 +319,11 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
                     trajectory.trains = True
                 kept = [*direct[-limit:], *detours[-limit:]]
                 dropped = [*direct[:-limit], *detours[:-limit]]
+                # How far the mode is from having its fill; what is in no mode is all new
+                novelty = 1.0 if mode == NO_MODE else 1.0 - min(len(direct) / limit, 1.0)
                 for trajectory in members:
                     self._change_mode(trajectory, mode, parents)
+                    self.way_novelty[trajectory.rows[-1]] = novelty * (trajectory.success and not trajectory.foreign)
                 stays += kept
                 goes += dropped
         for trajectory in sorted(stays, key=lambda t: t.serial):
@@ -324,6 +332,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
                 self.mode_rows[trajectory.mode].add(trajectory.rows)
         for trajectory in sorted(goes, key=lambda t: t.serial):
             trajectory.mode, trajectory.trains, trajectory.path = NO_MODE, False, None
+            self.way_novelty[trajectory.rows[-1]] = 0.0
             self._retired.append(trajectory)
 
     def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:
@@ -404,7 +413,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         # What led away from the route is for the critic to judge, not for the policy to follow
         imitated = active[:, None] & ~notes["foreign"][..., 0]
         imitated[EXPLORATORY_GROUP] = True
-        rewards = (np.where(present & ~lost, rewards, 0.0) * powers).sum(axis=-1)  # [G, n]
+        rewards = np.where(present & ~lost, rewards, 0.0) * powers
+        new_ways = (rewards[EXPLORATORY_GROUP] * notes["way_novelty"][EXPLORATORY_GROUP]).sum(axis=-1)  # [n]
+        rewards = rewards.sum(axis=-1)  # [G, n]
         lengths = present.sum(axis=-1)
         ends = lengths[..., None] - 1
         last = np.take_along_axis(windows, ends, axis=-1).ravel()
@@ -425,6 +436,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             discounts=self.to_torch(discounts.astype(np.float32)),
             active=self.to_torch(active),
             imitated=self.to_torch(imitated),
+            new_ways=self.to_torch(new_ways.astype(np.float32)),
             rows=rows,
             windows=np.where(lost, -1, windows),
         )

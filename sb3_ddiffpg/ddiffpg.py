@@ -110,6 +110,8 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
     :param novelty_scale: The factor alpha of NovelD
     :param intrinsic_coef: Factor c on the intrinsic reward
     :param mode_intrinsic_coef: Factor on the intrinsic reward that is added to the modes' rewards
+    :param new_way_coef: Factor on the environment's reward that the exploratory critics get for goals reached by ways that are
+        in no mode, or in one that has not its fill of trajectories yet: a second way is worth finding where the first pays
     :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
@@ -189,6 +191,7 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         novelty_scale: float = 0.5,
         intrinsic_coef: float = 0.05,
         mode_intrinsic_coef: float = 0.0,
+        new_way_coef: float = 0.0,
         normalize_intrinsic: bool = True,
         reset_new_critics: bool = True,
         max_grad_norm: float = 1.0,
@@ -265,6 +268,7 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         self.novelty_scale = novelty_scale
         self.intrinsic_coef = intrinsic_coef
         self.mode_intrinsic_coef = mode_intrinsic_coef
+        self.new_way_coef = new_way_coef
         self.normalize_intrinsic = normalize_intrinsic
         self.reset_new_critics = reset_new_critics
         self.max_grad_norm = max_grad_norm
@@ -393,7 +397,7 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         rewards = self.reward_scale * batch.rewards
         if everywhere:
             rewards = rewards + self.mode_intrinsic_coef * intrinsic
-        rewards[EXPLORATORY_GROUP] = intrinsic[EXPLORATORY_GROUP]
+        rewards[EXPLORATORY_GROUP] = intrinsic[EXPLORATORY_GROUP] + self.new_way_coef * self.reward_scale * batch.new_ways
         return rewards
 
     def _intrinsic_rewards(self, windows: np.ndarray, metrics: dict[str, list[th.Tensor]]) -> th.Tensor:

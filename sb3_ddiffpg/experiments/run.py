@@ -13,6 +13,7 @@ import platform
 import subprocess
 import sys
 import time
+from collections import Counter
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,6 +25,7 @@ import yaml
 from sb3_ddiffpg.callbacks import EvaluateModesCallback
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.evaluation import evaluate_modes
+from sb3_ddiffpg.trajectories import read_success
 from sb3_ddiffpg.zoo import ALGO, ALGOS, ModeExperimentManager, config_file, register
 
 # How often the modes are tested in training, as a share of the run, and in how many episodes for each command
@@ -43,7 +45,15 @@ class CurveCallback(EvaluateModesCallback):
     def __init__(self, folder: Path, **kwargs: Any) -> None:
         super().__init__(path=folder / "logs" / "evaluations.jsonl", best_model_path=folder / "model.zip", **kwargs)
         self.folder = folder
+        #: Goals reached in training, by the environment's label of the way
+        self.reached: Counter[str] = Counter()
         self._started, self._cpu = time.perf_counter(), time.process_time()
+
+    def _on_step(self) -> bool:
+        for done, info in zip(self.locals["dones"], self.locals["infos"], strict=True):
+            if done and info.get("mode") is not None and read_success(info, getattr(self.model, "success_key", None)):
+                self.reached[str(info["mode"])] += 1
+        return super()._on_step()
 
     def _on_training_end(self) -> None:
         if not self.evaluations or self.evaluations[-1][0] < self.num_timesteps:
@@ -66,6 +76,7 @@ class CurveCallback(EvaluateModesCallback):
         for label in found.listed:
             shares = [each.labels.get(label, 0) / each.n_episodes for each in (*found.commanded, found.uncommanded)]
             row[label] = round(max(shares), 3)
+            row[f"reached {label}"] = self.reached[label]
         path = self.folder / "curve.csv"
         new = len(self.evaluations) == 1
         with path.open("w" if new else "a", newline="") as file:
