@@ -7,14 +7,13 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, get_actor_critic_arch
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, UNCONDITIONED
-from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.diffusion import Denoiser, DiffusionModel
-from sb3_ddiffpg.features import ScaledFlattenExtractor
+from sb3_ddiffpg.twin_critic_policy import TwinCriticPolicy
 
 
 class DiffusionActor(BasePolicy):
@@ -104,7 +103,7 @@ class DiffusionActor(BasePolicy):
         return self(observation, deterministic)
 
 
-class DiffusionPolicy(BasePolicy):
+class DiffusionPolicy(TwinCriticPolicy):
     """
     Diffusion actor, critics of all modes with their targets, and the mode embeddings.
 
@@ -131,8 +130,6 @@ class DiffusionPolicy(BasePolicy):
     """
 
     actor: DiffusionActor
-    critics: ModeCritics
-    critics_target: ModeCritics
 
     def __init__(
         self,
@@ -157,80 +154,40 @@ class DiffusionPolicy(BasePolicy):
         exploration_support: tuple[float, float] = (0.0, 5.0),
         twin_target: str = "lower_mean",
     ) -> None:
-        if features_extractor_class is None:
-            is_dict = isinstance(observation_space, spaces.Dict)
-            features_extractor_class = CombinedExtractor if is_dict else ScaledFlattenExtractor
         super().__init__(
             observation_space,
             action_space,
-            features_extractor_class,
-            features_extractor_kwargs,
+            lr_schedule,
+            actor_class=DiffusionActor,
+            actor_kwargs=dict(
+                activation_fn=activation_fn,
+                n_diffusion_steps=n_diffusion_steps,
+                mode_embedding_dim=mode_embedding_dim,
+                time_embedding_dim=time_embedding_dim,
+            ),
+            net_arch=net_arch,
+            critic_activation_fn=critic_activation_fn,
+            features_extractor_class=features_extractor_class,
+            features_extractor_kwargs=features_extractor_kwargs,
+            normalize_images=normalize_images,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
-            squash_output=True,
-            normalize_images=normalize_images,
-        )
-        self._constructor = dict(
-            net_arch=net_arch,
-            activation_fn=activation_fn,
-            critic_activation_fn=critic_activation_fn,
-            n_diffusion_steps=n_diffusion_steps,
-            mode_embedding_dim=mode_embedding_dim,
-            time_embedding_dim=time_embedding_dim,
-            n_critics=n_critics,
-            n_atoms=n_atoms,
-            support=support,
-            exploration_support=exploration_support,
-            twin_target=twin_target,
-        )
-        actor_arch, critic_arch = get_actor_critic_arch([128, 128] if net_arch is None else net_arch)
-        extractor = self.make_features_extractor()
-        self.actor = DiffusionActor(
-            observation_space,
-            action_space,
-            net_arch=actor_arch,
-            features_extractor=extractor,
-            features_dim=extractor.features_dim,
-            activation_fn=activation_fn,
-            n_diffusion_steps=n_diffusion_steps,
-            mode_embedding_dim=mode_embedding_dim,
-            time_embedding_dim=time_embedding_dim,
-            normalize_images=normalize_images,
-        )
-        critic_arguments: dict[str, Any] = dict(
-            features_dim=extractor.features_dim,
-            action_dim=int(np.prod(action_space.shape)),
-            net_arch=critic_arch,
             n_groups=n_modes + 1,
-            activation_fn=critic_activation_fn,
             n_critics=n_critics,
             n_atoms=n_atoms,
             support=support,
             exploration_support=exploration_support,
             twin_target=twin_target,
         )
-        self.critics = ModeCritics(**critic_arguments)
-        self.critics_target = ModeCritics(**critic_arguments)
-        self.critics_target.load_state_dict(self.critics.state_dict())
-        # The critics see through their own extractor: the denoising loss must not shape their features
-        self.critic_features_extractor = self.make_features_extractor()
-        self.critic_features_extractor_target = self.make_features_extractor()
-        self.critic_features_extractor_target.load_state_dict(self.critic_features_extractor.state_dict())
+        self._constructor.update(
+            activation_fn=activation_fn,
+            n_diffusion_steps=n_diffusion_steps,
+            mode_embedding_dim=mode_embedding_dim,
+            time_embedding_dim=time_embedding_dim,
+        )
         self.mode_embeddings: th.Tensor
         self.register_buffer("mode_embeddings", th.randn(n_modes + 1, mode_embedding_dim))
-        chosen = {"fused", "foreach", "differentiable"} & set(self.optimizer_kwargs)
-        if not chosen and optimizer_class in (th.optim.Adam, th.optim.AdamW):
-            # One kernel instead of one per parameter: a third of a small update's time
-            optimizer_kwargs = {"fused": True, **self.optimizer_kwargs}
-        else:
-            optimizer_kwargs = self.optimizer_kwargs
-        make: Any = optimizer_class
-        self.actor.optimizer = make(self.actor.parameters(), lr=lr_schedule(1), **optimizer_kwargs)
-        parameters = [*self.critics.parameters(), *self.critic_features_extractor.parameters()]
-        self.critics.optimizer = make(parameters, lr=lr_schedule(1), **optimizer_kwargs)
         self._embeddings_in_use: th.Tensor | None = None
-        self.critics_target.train(False)
-        self.critic_features_extractor_target.train(False)
 
     @property
     def n_modes(self) -> int:
@@ -238,17 +195,7 @@ class DiffusionPolicy(BasePolicy):
         return self.critics.n_groups - 1
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        data.update(
-            self._constructor,
-            n_modes=self.n_modes,
-            lr_schedule=self._dummy_schedule,
-            optimizer_class=self.optimizer_class,
-            optimizer_kwargs=self.optimizer_kwargs,
-            features_extractor_class=self.features_extractor_class,
-            features_extractor_kwargs=self.features_extractor_kwargs,
-        )
-        return data
+        return {**super()._get_constructor_parameters(), "n_modes": self.n_modes}
 
     # ------------------------------------------------------------------ modes
 
@@ -327,19 +274,6 @@ class DiffusionPolicy(BasePolicy):
         values = self.critics.values(self.critics(features, actions)).min(dim=1).values
         return values.unflatten(1, (-1, n_actions)).mean(dim=2)
 
-    def critic_features(self, obs: PyTorchObs, target: bool = False) -> th.Tensor:
-        """
-        :param obs: Observations, G groups of n rows, [G * n, ...]
-        :param target: Through the target's extractor
-        :return: Shape [G, n, features_dim]
-        """
-        extractor = self.critic_features_extractor_target if target else self.critic_features_extractor
-        features = self.extract_features(obs, extractor)
-        return features.unflatten(0, (self.critics.n_groups, -1))
-
-    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self._predict(obs, deterministic)
-
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self.actor(observation, deterministic, self._embeddings_in_use)
 
@@ -405,12 +339,3 @@ class DiffusionPolicy(BasePolicy):
         if self.n_modes:
             held[starts] = np.random.randint(0, self.n_modes, size=int(starts.sum()))
         return held
-
-    def set_training_mode(self, mode: bool) -> None:
-        """
-        :param mode: True for training, False for evaluation (dropout, batch norm of the extractors)
-        """
-        self.actor.set_training_mode(mode)
-        self.critics.train(mode)
-        self.critic_features_extractor.train(mode)
-        self.training = mode
