@@ -33,7 +33,7 @@ PARTS = {
     "novelty": "_rewards",
     "critics, denoising in it": "_update_critics",
     "ascent": "_improve_target_actions",
-    "policy": "_update_actor",
+    "policy": "_update_policy",
     "targets": "_update_targets",
 }
 

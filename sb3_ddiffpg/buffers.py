@@ -228,6 +228,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         """
         for name in ("success_key", *_MODE_SETTINGS):
             setattr(self, name, getattr(other, name))
+        self.move_storage(other.storage_device)
         self._success_rule.success_key = other.success_key
 
     def path(self, trajectory: Trajectory) -> np.ndarray:
@@ -432,11 +433,11 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             actions=actions,
             target_actions=th.cat((exploratory[:1], targets[1:])),
             next_observations=self.normalized(self._as_observation(nexts, "next_observations"), env),
-            rewards=self.to_torch(rewards.astype(np.float32)),
-            discounts=self.to_torch(discounts.astype(np.float32)),
-            active=self.to_torch(active),
-            imitated=self.to_torch(imitated),
-            new_ways=self.to_torch(new_ways.astype(np.float32)),
+            rewards=self._to_device(rewards.astype(np.float32)),
+            discounts=self._to_device(discounts.astype(np.float32)),
+            active=self._to_device(active),
+            imitated=self._to_device(imitated),
+            new_ways=self._to_device(new_ways.astype(np.float32)),
             rows=rows,
             windows=np.where(lost, -1, windows),
         )
@@ -464,5 +465,5 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self._steps.write("exploratory_target_actions", batch.rows[0], target_actions[0])
         groups = [mode + 1 for mode, row_set in enumerate(self.mode_rows) if row_set.size]
         if groups:
-            improved = target_actions if len(groups) + 1 == len(target_actions) else target_actions[groups]
-            self._steps.write("target_actions", batch.rows[groups].ravel(), improved[-len(groups) :].flatten(0, 1))
+            improved = th.cat([target_actions[group] for group in groups])
+            self._steps.write("target_actions", batch.rows[groups].ravel(), improved)

@@ -132,8 +132,9 @@ class EvaluateModesCallback(_PeriodicCallback):
     :param eval_freq: Environment steps between two evaluations
     :param n_episodes: Episodes for each command, and twice as many without
     :param path: Of a file to which each evaluation is appended, one line of JSON each
-    :param best_model_path: Where the model is saved whenever its ``commanded_modes`` (then its uncommanded successes) are as
-        many as never before. Evaluate it again, in fresh episodes, before you report it: it was chosen for these
+    :param best_model_path: Of a .zip file, where the model is saved (and ``vecnormalize.pkl`` beside it) whenever its
+        ``commanded_modes``, then its uncommanded successes, are as many as never before. Evaluate it again, in fresh episodes,
+        before you report it: it was chosen for these
     :param kwargs: Further arguments of ``evaluate_modes``
     """
 
@@ -150,6 +151,8 @@ class EvaluateModesCallback(_PeriodicCallback):
         self.eval_env, self.n_episodes, self.kwargs = eval_env, n_episodes, kwargs
         self.path = None if path is None else Path(path)
         self.best_model_path = None if best_model_path is None else Path(best_model_path)
+        if self.best_model_path is not None and self.best_model_path.suffix != ".zip":
+            raise ValueError(f"best_model_path: {best_model_path} given; accepted is the path of a .zip file")
         #: Environment steps at which the best model was saved, None: not yet
         self.best_step: int | None = None
         self._best = (-1.0, -1.0)
@@ -185,10 +188,13 @@ class EvaluateModesCallback(_PeriodicCallback):
                 file.write(json.dumps({"step": self.num_timesteps, **found.to_dict()}) + "\n")
         score = (found.commanded_modes, found.uncommanded.success_rate)
         if self.best_model_path is not None and score > self._best:
-            self._best, self.best_step = score, self.num_timesteps
             unfinished = self.best_model_path.with_name(f".{self.best_model_path.stem}.zip")
             self.model.save(unfinished)
             os.replace(unfinished, self.best_model_path)  # whole, or the one before
+            self._best, self.best_step = score, self.num_timesteps
+            normalizer = self.model.get_vec_normalize_env()
+            if normalizer is not None:
+                normalizer.save(str(self.best_model_path.with_name("vecnormalize.pkl")))
 
 
 class ModeFigureCallback(_PeriodicCallback):

@@ -4,44 +4,35 @@ import contextlib
 import io
 import pathlib
 import uuid
-import warnings
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
-from scipy.signal import lfilter
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TensorDict
-from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
-from stable_baselines3.common.vec_env import VecEnv
-from torch.optim.swa_utils import get_ema_multi_avg_fn
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.utils import FloatSchedule
 
+from sb3_ddiffpg.actor_critic import NoveltyActorCritic
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, Behavior
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.callbacks import ClusteringCallback, contains_clustering
-from sb3_ddiffpg.critics import ModeCritics
-from sb3_ddiffpg.features import declared_cell_size, declared_mode_features, describe_env, same_selection
+from sb3_ddiffpg.features import same_selection
 from sb3_ddiffpg.history import ModeHistory
-from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, noveld_reward
 from sb3_ddiffpg.mode_control import ModeControl
 from sb3_ddiffpg.modes import Mode, ModeTable, Outcome, default_name
-from sb3_ddiffpg.noise import SpreadNormalActionNoise
 from sb3_ddiffpg.policies import DiffusionActor, DiffusionPolicy
 from sb3_ddiffpg.target_actions import ascend
-from sb3_ddiffpg.trajectories import NO_MODE, Trajectory
-from sb3_ddiffpg.validation import check_arguments
-from sb3_ddiffpg.visits import VisitMap
+from sb3_ddiffpg.trajectories import NO_MODE
+from sb3_ddiffpg.validation import check_mode_arguments
 
 SelfDDiffPG = TypeVar("SelfDDiffPG", bound="DDiffPG")
 
 
-class DDiffPG(ModeControl, OffPolicyAlgorithm):
+class DDiffPG(ModeControl, NoveltyActorCritic):
     """
     Deep Diffusion Policy Gradient (DDiffPG): learns several ways to solve one task.
 
@@ -219,32 +210,38 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
             replay_buffer_kwargs=replay_buffer_kwargs,
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
-            policy_kwargs=policy_kwargs,
+            qf_learning_rate=qf_learning_rate,
+            n_critics=n_critics,
+            n_atoms=n_atoms,
+            twin_target=twin_target,
+            v_min=v_min,
+            v_max=v_max,
+            reward_scale=reward_scale,
+            target_policy_noise=target_policy_noise,
+            target_noise_clip=target_noise_clip,
+            mode_features=mode_features,
+            success_key=success_key,
+            novelty=novelty,
+            novelty_kwargs=novelty_kwargs,
+            novelty_scale=novelty_scale,
+            intrinsic_coef=intrinsic_coef,
+            normalize_intrinsic=normalize_intrinsic,
+            max_grad_norm=max_grad_norm,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
             verbose=verbose,
-            device=device,
             seed=seed,
-            sde_support=False,
-            supported_action_spaces=(spaces.Box,),
-            support_multi_env=True,
+            device=device,
+            _init_setup_model=False,
         )
-        self.qf_learning_rate = qf_learning_rate
         self.n_diffusion_steps = n_diffusion_steps
         self.action_lr = action_lr
         self.n_action_gradient_steps = n_action_gradient_steps
         self.action_optimizer = action_optimizer
-        self.n_critics = n_critics
-        self.n_atoms = n_atoms
-        self.twin_target = twin_target
-        self.v_min = v_min
-        self.v_max = v_max
         self.exploration_v_max = exploration_v_max
-        self.reward_scale = reward_scale
         self.mode_n_steps = mode_n_steps
         self.exploration_n_steps = exploration_n_steps
-        self.target_policy_noise = target_policy_noise
-        self.target_noise_clip = target_noise_clip
         self.backup_embedding = backup_embedding
         self.recluster_freq = recluster_freq
         self.distance_threshold = distance_threshold
@@ -258,20 +255,12 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         self.max_failures_per_mode = max_failures_per_mode
         self.mode_embedding_dim = mode_embedding_dim
         self.mode_mask_prob = mode_mask_prob
-        self.mode_features = mode_features
-        self.success_key = success_key
         self.exploration_share = exploration_share
         self.exploration_fraction = exploration_fraction
         self.explore_then_exploit = explore_then_exploit
-        self.novelty = novelty
-        self.novelty_kwargs = novelty_kwargs
-        self.novelty_scale = novelty_scale
-        self.intrinsic_coef = intrinsic_coef
         self.mode_intrinsic_coef = mode_intrinsic_coef
         self.new_way_coef = new_way_coef
-        self.normalize_intrinsic = normalize_intrinsic
         self.reset_new_critics = reset_new_critics
-        self.max_grad_norm = max_grad_norm
 
         # What a run remembers beside its networks; all of it is saved
         self.n_rollouts = 0
@@ -280,83 +269,42 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         self._next_mode_number = 0
         self.mode_history = ModeHistory()
         self._steps_before = 0  # of earlier calls of ``learn`` that counted from 0
-        self.is_normalized = False
-        self.visits: VisitMap | None = None
-        self.env_spec: str | None = None
         self._behavior = Behavior(0)
-        self._resolved_features: Any = None
-        self._warned_support = False
 
         if _init_setup_model:
             self._setup_model()
 
     # ------------------------------------------------------------------ set-up
 
-    def _setup_model(self) -> None:
-        check_arguments(self)
-        if self.replay_buffer_class is None:
-            self.replay_buffer_class = ModeReplayBuffer
-        self._resolve_mode_features()
-        given = self.policy_kwargs, self.replay_buffer_kwargs
-        # Not stored in the model: what the user gave is what ``load`` compares and ``save`` keeps
-        self.policy_kwargs = {
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {
+            **super()._policy_arguments(),
             "n_modes": len(self._modes),
             "n_diffusion_steps": self.n_diffusion_steps,
             "mode_embedding_dim": self.mode_embedding_dim,
-            "n_critics": self.n_critics,
-            "n_atoms": self.n_atoms,
-            "twin_target": self.twin_target,
-            "support": (self.v_min, self.v_max),
             "exploration_support": (0.0, self.exploration_v_max),
-            **self.policy_kwargs,
         }
-        self.replay_buffer_kwargs = {
-            "mode_features": self._resolved_features,
-            "success_key": self.success_key,
+
+    def _buffer_arguments(self) -> dict[str, Any]:
+        return {
+            **super()._buffer_arguments(),
             "max_successes_per_mode": self.max_successes_per_mode,
             "max_failures_per_mode": self.max_failures_per_mode,
-            **self.replay_buffer_kwargs,
         }
-        try:
-            super()._setup_model()
-        finally:
-            self.policy_kwargs, self.replay_buffer_kwargs = given
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_mode_arguments(self)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
         self.replay_buffer.expect_modes(len(self._modes))
-        noise = self.action_noise
-        if noise is None or (isinstance(noise, SpreadNormalActionNoise) and noise.shape[0] != self.n_envs):
-            # None given, or loaded with another number of environments
-            deviations = {} if noise is None else {"low": noise.low, "high": noise.high}
-            action_dim = int(np.prod(self.action_space.shape or (1,)))
-            self.action_noise = SpreadNormalActionNoise(self.n_envs, action_dim, **deviations)
-        if self.visits is None and self.replay_buffer.features.dim <= 3:
-            self.visits = VisitMap(self.replay_buffer.features.dim, declared_cell_size(self.env))
-        if self.env is not None:
-            self.env_spec = describe_env(self.env)
-            self.is_normalized = self._vec_normalize_env is not None
-        measure = NOVELTY_MEASURES[self.novelty] if isinstance(self.novelty, str) else self.novelty
-        self.novelty_model: Any = measure(
-            self.replay_buffer.features.dim, self.policy.actor.features_dim, **(self.novelty_kwargs or {})
-        ).to(self.device)
-        self.intrinsic_moments = RunningMoments(1, max_count=100_000).to(self.device)
-        self._qf_schedule = self.lr_schedule if self.qf_learning_rate is None else FloatSchedule(self.qf_learning_rate)
-        self._create_aliases()
 
     def _resolve_mode_features(self) -> None:
         before = self._resolved_features
-        if self.mode_features is not None:
-            self._resolved_features = self.mode_features
-        elif self.env is not None:
-            self._resolved_features = declared_mode_features(self.env)
+        super()._resolve_mode_features()
         if self._modes and not same_selection(before, self._resolved_features):
             raise ValueError(f"mode_features={self._resolved_features}: the modes of this model were found in {before}")
-
-    def _create_aliases(self) -> None:
-        self.actor = self.policy.actor
-
-    @property
-    def critics(self) -> ModeCritics:
-        """The critics of all groups, see ``critics.ModeCritics``."""
-        return self.policy.critics
 
     # ------------------------------------------------------------------ learning
 
@@ -367,8 +315,7 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         :param gradient_steps: Number of updates
         :param batch_size: Transitions per update, over all groups
         """
-        self.policy.set_training_mode(True)
-        self._update_learning_rates()
+        self._begin_updates()
         metrics: dict[str, list[th.Tensor]] = defaultdict(list)
         for _ in range(gradient_steps):
             # Sample one batch per mode, and one for the exploratory group
@@ -382,12 +329,9 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
             target_actions = self._improve_target_actions(batch)
             metrics["target_action_shift"].append((target_actions - batch.target_actions).abs().mean())
             # Concatenate all batches and update the diffusion policy
-            metrics["actor_loss"].append(self._update_actor(batch, target_actions))
+            metrics["actor_loss"].append(self._update_policy(batch, target_actions))
             self._update_targets()
-        self._n_updates += gradient_steps
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in metrics.items():
-            self.logger.record(f"train/{name}", th.stack(values).mean().item())
+        self._end_updates(gradient_steps, metrics)
 
     def _rewards(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> th.Tensor:
         """Intrinsic reward for the exploratory group, the environment's (and some intrinsic) for the modes, [G, n]."""
@@ -400,40 +344,6 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         rewards[EXPLORATORY_GROUP] = intrinsic[EXPLORATORY_GROUP] + self.new_way_coef * self.reward_scale * batch.new_ways
         return rewards
 
-    def _intrinsic_rewards(self, windows: np.ndarray, metrics: dict[str, list[th.Tensor]]) -> th.Tensor:
-        """
-        Discounted NovelD rewards over windows of consecutive rows, followed by one step of the novelty measure.
-
-        :param windows: Rows, [G, n, n_steps], -1 beyond a window's end
-        :param metrics: Where to note the mean and the loss
-        :return: [G, n]
-        """
-        present = windows >= 0
-        inputs = [self._novelty_inputs(obs) for obs in self.replay_buffer.read_observations(windows[present])]
-        now, then = (self.novelty_model.novelty(*each) for each in inputs)
-        reward = noveld_reward(now, then, self.novelty_scale)
-        metrics["intrinsic_reward"].append(reward.mean())
-        if self.normalize_intrinsic:
-            self.intrinsic_moments.update(reward[:, None])
-            # Not centred: where nothing is new, a negative reward would make it worth while to end the episode at a goal.
-            # Limited: one surprising state would dominate the values for long
-            reward = (reward / (self.intrinsic_moments.var.sqrt() + 1e-8)).clamp(max=10.0)
-        if self.novelty_model.optimizer is not None:
-            metrics["novelty_loss"].append(self.novelty_model.update(*inputs[1]))
-        places = th.from_numpy(np.flatnonzero(present)).to(self.device, non_blocking=True)
-        rewards = reward.new_zeros(windows.size).index_copy(0, places, reward).view(windows.shape)
-        discounts = self.gamma ** th.arange(windows.shape[-1], device=self.device)
-        return self.intrinsic_coef * (rewards * discounts).sum(dim=-1).float()
-
-    def _novelty_inputs(self, obs: Any) -> tuple[th.Tensor, th.Tensor]:
-        """Positions [N, position_dim] and scaled features [N, features_dim] of observations, not normalised, on the device."""
-        positions = self.replay_buffer.features.of_tensors(obs)
-        if not getattr(self.novelty_model, "with_observation", False):
-            return positions, positions
-        obs = self.replay_buffer.normalized(obs, self._vec_normalize_env)
-        with th.no_grad():
-            return positions, self.actor.extract_features(obs, self.actor.features_extractor)
-
     def _row_embeddings(self, batch: ModeBatch, masked: bool) -> th.Tensor:
         """Embedding of every row's group, [G * n, mode_embedding_dim]; masked with probability p, exploration never."""
         n_groups, n = batch.rows.shape
@@ -444,23 +354,9 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
             embeddings = embeddings * keep
         return embeddings.reshape(n_groups * n, -1)
 
-    def _update_critics(self, batch: ModeBatch, rewards: th.Tensor) -> th.Tensor:
-        policy, shape = self.policy, batch.actions.shape
-        with th.no_grad():
-            embeddings = self._row_embeddings(batch, masked=self.backup_embedding == "masked")
-            next_actions = self.actor(batch.next_observations, embeddings=embeddings)
-            noise = (th.randn_like(next_actions) * self.target_policy_noise).clamp(
-                -self.target_noise_clip, self.target_noise_clip
-            )
-            next_actions = (next_actions + noise).clamp(-1.0, 1.0).view(shape)
-            next_features = policy.critic_features(batch.next_observations, target=True)
-            targets = policy.critics_target.bellman_target(next_features, next_actions, rewards, batch.discounts)
-        losses = policy.critics.loss(policy.critic_features(batch.observations), batch.actions, targets)
-        policy.critics.optimizer.zero_grad(set_to_none=True)
-        (losses * batch.active).sum().backward()
-        policy.critics.clip_gradients(self.max_grad_norm)
-        policy.critics.optimizer.step()
-        return losses.detach().mean()
+    def _next_actions(self, batch: ModeBatch) -> tuple[th.Tensor, th.Tensor | float]:
+        embeddings = self._row_embeddings(batch, masked=self.backup_embedding == "masked")
+        return self.actor(batch.next_observations, embeddings=embeddings), 0.0
 
     def _improve_target_actions(self, batch: ModeBatch) -> th.Tensor:
         """a_target <- a_target + eta * grad_a Q_i(s, a_target), K times, written back to the buffer. [G, n, action_dim]"""
@@ -476,7 +372,7 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         self.replay_buffer.store_target_actions(batch, target_actions)
         return target_actions
 
-    def _update_actor(self, batch: ModeBatch, target_actions: th.Tensor) -> th.Tensor:
+    def _update_policy(self, batch: ModeBatch, target_actions: th.Tensor) -> th.Tensor:
         condition = self.actor.condition(batch.observations, self._row_embeddings(batch, masked=True))
         weights = batch.imitated.flatten().float()
         loss = self.actor.diffusion.loss(target_actions.flatten(0, 1), condition, weights=weights)
@@ -485,26 +381,6 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         th.nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
         self.actor.optimizer.step()
         return loss.detach()
-
-    def _update_targets(self) -> None:
-        policy = self.policy
-        online = [*policy.critics.parameters(), *policy.critic_features_extractor.parameters()]
-        targets = [*policy.critics_target.parameters(), *policy.critic_features_extractor_target.parameters()]
-        # Polyak averaging, in one kernel
-        get_ema_multi_avg_fn(1 - self.tau)(targets, online, None)
-        # Running statistics of a batch norm are copied, as in SB3
-        statistics = policy.critic_features_extractor.buffers(), policy.critic_features_extractor_target.buffers()
-        for current, target in zip(*statistics, strict=True):
-            target.copy_(current)
-
-    def _update_learning_rates(self) -> None:
-        progress = self._current_progress_remaining
-        for name, optimizer, schedule in (
-            ("learning_rate", self.actor.optimizer, self.lr_schedule),
-            ("qf_learning_rate", self.policy.critics.optimizer, self._qf_schedule),
-        ):
-            self.logger.record(f"train/{name}", schedule(progress))
-            update_learning_rate(optimizer, schedule(progress))
 
     # ------------------------------------------------------------------ acting
 
@@ -538,26 +414,12 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
             indices = table.index(mode) if single else np.array([table.index(each) for each in mode])  # type: ignore[arg-type, union-attr]
         return self.policy.predict(observation, state, episode_start, deterministic, mode=indices)
 
-    def _sample_action(
-        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
-    ) -> tuple[np.ndarray, np.ndarray]:
-        assert self._last_obs is not None, "self._last_obs was not set"
-        # Before the environments are given an action that follows from NaN
-        self.replay_buffer.check_finite("observation", self._last_obs)
-        shape = (n_envs, *self.action_space.shape)  # type: ignore[misc]
-        if self.num_timesteps < learning_starts:
-            scaled_action = np.random.uniform(-1.0, 1.0, size=shape).astype(np.float32)
-        else:
-            lengths = [mode.mean_length for mode in self._modes if mode.n_trajectories]
-            if lengths:
-                # On average after the time that a mode needs for all of its way
-                self._behavior.hand_over(len(self._modes), 1 / float(np.mean(lengths)))
-            action, _ = self.policy.predict(self._last_obs, group=self._behavior.groups)
-            scaled_action = self.policy.scale_action(action)
-            if action_noise is not None:
-                scaled_action = np.clip(scaled_action + action_noise().reshape(shape), -1.0, 1.0)
-            self.replay_buffer.check_finite("policy's action (has training diverged?)", scaled_action)
-        return self.policy.unscale_action(scaled_action), scaled_action
+    def _training_actions(self) -> np.ndarray:
+        lengths = [mode.mean_length for mode in self._modes if mode.n_trajectories]
+        if lengths:
+            # On average after the time that a mode needs for all of its way
+            self._behavior.hand_over(len(self._modes), 1 / float(np.mean(lengths)))
+        return self.policy.predict(self._last_obs, group=self._behavior.groups)[0]  # type: ignore[arg-type]
 
     def _exploration_share(self) -> float:
         if self.num_timesteps < self.learning_starts:
@@ -569,109 +431,25 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
 
     def _store_transition(self, replay_buffer: ModeReplayBuffer, *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
         super()._store_transition(replay_buffer, *args, **kwargs)
-        positions = replay_buffer.last_positions()
-        self.novelty_model.observe(th.as_tensor(positions, device=self.device))
-        if self.visits is not None:
-            self.visits.observe(positions)
         for env, trajectory in replay_buffer.just_finished:
             mode = self._behavior.commanded_mode(env)
             if mode is not None:
                 trajectory.commanded = self._modes[mode].number
                 self._modes[mode].outcomes.append(Outcome(trajectory.success, trajectory.episode_return, trajectory.length))
                 self._modes[mode].unjudged += 1
-            self._warn_outside_support(trajectory)
             self._behavior.begin(env, len(self._modes), self._exploration_share(), self.explore_then_exploit)
 
-    def _warn_outside_support(self, trajectory: Trajectory) -> None:
-        """Once: values that the critics cannot represent make all actions look alike."""
-        if self._warned_support:
-            return
-        rewards = self.reward_scale * self.replay_buffer.rewards[trajectory.rows]
-        returns = lfilter([1.0], [1.0, -self.gamma], rewards[::-1])
-        if returns.max() > self.v_max + 1e-6 or returns.min() < self.v_min - 1e-6:
-            self._warned_support = True
-            warnings.warn(
-                f"A discounted return between {returns.min():.4g} and {returns.max():.4g} leaves the critics' support "
-                f"[v_min={self.v_min}, v_max={self.v_max}] and is clipped: adapt v_min, v_max or reward_scale"
-            )
+    # ------------------------------------------------------------------ a run's beginning
 
-    # ------------------------------------------------------------------ a run's beginning and end
+    def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        steps = self.num_timesteps
+        prepared = super()._setup_learn(total_timesteps, *args, **kwargs)
+        if self.num_timesteps < steps:  # counted anew
+            self._steps_before += steps
+        return prepared
 
-    def learn(
-        self: SelfDDiffPG,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 100,
-        tb_log_name: str = "DDiffPG",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfDDiffPG:
-        """
-        Train the model. See SB3's ``learn``; ``log_interval`` counts episodes of all environments.
-        """
-        # Denormal numbers in Adam's moments slow a small update down by half
-        th.set_flush_denormal(True)
-        try:
-            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-        finally:
-            th.set_flush_denormal(False)
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        assert self.env is not None, "You must set the environment before calling learn()"
-        self._check_buffer(self.env)
-        if self._vec_normalize_env is not None and self._vec_normalize_env.norm_reward:
-            warnings.warn(
-                "VecNormalize scales the rewards (norm_reward=True), and so the values, which the critics' support "
-                f"[v_min={self.v_min}, v_max={self.v_max}] must cover; norm_reward=False leaves them in reward units"
-            )
-        if reset_num_timesteps:
-            self._steps_before += self.num_timesteps
-        new_episodes = reset_num_timesteps or self._last_obs is None
-        if new_episodes:
-            self.replay_buffer.drop_unfinished_episodes()
-        total_timesteps, callback = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        # What an earlier run left behind would end the exploration of this one's first episodes
-        self._update_current_progress_remaining(self.num_timesteps, max(total_timesteps, 1))
-        if new_episodes:
-            self._behavior.begin_all(self.n_envs, len(self._modes), self._exploration_share(), self.explore_then_exploit)
-        return total_timesteps, callback
-
-    def _check_buffer(self, env: VecEnv) -> None:
-        """The episodes in progress must fit, or hours later there would be nothing to evict."""
-        if self.replay_buffer.n_envs != self.n_envs:
-            raise ValueError(f"The replay buffer was made for {self.replay_buffer.n_envs} environment(s), got {self.n_envs}")
-        try:
-            limit = getattr(env.get_attr("spec", indices=0)[0], "max_episode_steps", None)
-        except AttributeError:
-            return
-        if limit is not None and self.replay_buffer.buffer_size < limit * self.n_envs:
-            raise ValueError(
-                f"buffer_size={self.replay_buffer.buffer_size} is smaller than one episode of every environment: "
-                f"{self.n_envs} x {limit} steps"
-            )
-
-    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """
-        See SB3. A callback that stops the training makes SB3 drop the last transition (its issue 2056), and so does an error
-        or an interrupt: the next ``learn`` then resets the environments, or the running trajectories would have a gap.
-        """
-        complete = False
-        try:
-            rollout = super().collect_rollouts(*args, **kwargs)
-            complete = rollout.continue_training
-        finally:
-            if not complete:
-                self._last_obs = None
-        return rollout
+    def _begin_episodes(self) -> None:
+        self._behavior.begin_all(self.n_envs, len(self._modes), self._exploration_share(), self.explore_then_exploit)
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         callbacks = callback if isinstance(callback, list) else [callback]
@@ -682,15 +460,6 @@ class DDiffPG(ModeControl, OffPolicyAlgorithm):
         return super()._init_callback(callbacks, progress_bar)
 
     # ------------------------------------------------------------------ saving
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor"]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        names = ["policy", "actor.optimizer", "policy.critics.optimizer", "novelty_model", "intrinsic_moments"]
-        if self.novelty_model.optimizer is not None:
-            names.append("novelty_model.optimizer")
-        return names, []
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"

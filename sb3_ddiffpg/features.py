@@ -117,6 +117,7 @@ class ModeFeatures:
         self, observation_space: spaces.Space, selection: Sequence[int] | np.ndarray | str | Callable | None = None
     ) -> None:
         self.selection: Any = selection
+        self._indices: th.Tensor | None = None  # the selection, on the device where it was asked for last
         self.whole_observation = selection is None
         if isinstance(selection, str):
             keys = list(observation_space.spaces) if isinstance(observation_space, spaces.Dict) else []
@@ -147,8 +148,13 @@ class ModeFeatures:
         if callable(self.selection):
             return np.asarray(self.selection(observations)).astype(np.float32)
         if isinstance(observations, dict):
-            return self.of_tensors({key: th.as_tensor(value) for key, value in observations.items()}).numpy()
-        return self.of_tensors(th.as_tensor(observations)).numpy()
+            return self.of_tensors({key: self._copy(value) for key, value in observations.items()}).numpy()
+        return self.of_tensors(self._copy(observations)).numpy()
+
+    @staticmethod
+    def _copy(array: np.ndarray) -> th.Tensor:
+        """Environments may write into their arrays later, and have other byte orders than torch."""
+        return th.from_numpy(np.array(array, dtype=array.dtype.newbyteorder("="), order="C"))
 
     def of_tensors(self, observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor:
         """
@@ -166,4 +172,8 @@ class ModeFeatures:
             keys = sorted(observations) if self.selection is None else [self.selection]
             return th.cat([observations[key].reshape(len(observations[key]), -1).float() for key in keys], dim=1)
         flat = observations.reshape(len(observations), -1)
-        return (flat if self.selection is None else flat[:, self.selection]).float()
+        if self.selection is None:
+            return flat.float()
+        if self._indices is None or self._indices.device != flat.device:
+            self._indices = th.as_tensor(self.selection, device=flat.device)
+        return flat.index_select(1, self._indices).float()

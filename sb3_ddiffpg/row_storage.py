@@ -109,8 +109,13 @@ class DeviceRows:
         :param values: Shape [N, ...]
         """
         field = self[name]
-        values = th.as_tensor(values).to(field.device, field.dtype, non_blocking=True)
-        field.index_copy_(0, self._indices(rows), values.reshape(len(rows), *field.shape[1:]))
+        values = (th.from_numpy(values) if isinstance(values, np.ndarray) else values).to(
+            field.device, field.dtype, non_blocking=True
+        )
+        # As bytes: not every type can be copied by index
+        raw = values.reshape(len(rows), -1).contiguous().view(th.uint8)
+        offset = self.layout.dtype.fields[name][1]  # type: ignore[index]
+        self.bytes[:, offset : offset + raw.shape[1]].index_copy_(0, self._indices(rows), raw)
 
     def dump(self, n_rows: int) -> np.ndarray:
         """

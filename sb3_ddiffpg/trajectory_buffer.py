@@ -1,5 +1,6 @@
 """Replay buffer that keeps whole trajectories: rows, running and finished episodes, eviction."""
 
+import warnings
 from collections import deque
 from typing import Any
 
@@ -33,7 +34,7 @@ class TrajectoryReplayBuffer(ReplayBuffer):
     :param handle_timeout_termination: Whether time limits are bootstrapped through
     :param success_key: Key of ``info`` that marks a success; None reads ``is_success`` or ``success`` and, where neither
         exists, counts the trajectories whose return is in the top fifth of those seen lately
-    :param storage_device: Where observations and actions live: ``"cpu"``, or ``"cuda"`` where its memory holds them
+    :param storage_device: Where observations and actions live: ``"cpu"``, or ``"auto"``: where the samples go
     :raises ValueError: If ``buffer_size`` is not positive or ``optimize_memory_usage`` is asked for
     """
 
@@ -67,12 +68,16 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         self.optimize_memory_usage = False
         self.handle_timeout_termination = handle_timeout_termination
         self.success_key = success_key
-        self.storage_device = th.device(storage_device)
+        self._allocated = False
+        self.storage_device = self._resolve_storage(storage_device)
         self.reset()
 
     def reset(self) -> None:
         """Forget everything and release the storage."""
         super().reset()
+        if self._allocated:
+            for name in ("_steps", "_nexts", "_notes", *self._view_names()):
+                delattr(self, name)
         self._allocated = False
         self._free = np.empty(0, dtype=np.int32)  # stack of rows that were used and freed
         self._n_free = 0
@@ -85,9 +90,30 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         #: Indices of modes whose successes are evicted last
         self.frozen_modes: set[int] = set()
         self._n_finished = 0
-        self._last_rows = np.empty(0, dtype=np.int32)
         self._success_rule = SuccessRule(self.success_key)
         self.just_finished: list[tuple[int, Trajectory]] = []
+
+    def _resolve_storage(self, asked: th.device | str) -> th.device:
+        """Rows go straight to the networks or stay in the main memory: nowhere else."""
+        if asked == "auto":
+            return self.device
+        if not isinstance(asked, (str, th.device)):
+            raise ValueError(f"storage_device must be 'cpu', 'auto' or the samples' device, got {asked!r}")
+        device = th.device(asked)
+        if device.type != "cpu" and device.type != self.device.type:
+            warnings.warn(f"storage_device={asked!r}: the samples go to {self.device}, so the rows stay in the main memory")
+            return th.device("cpu")
+        return device
+
+    def move_storage(self, device: th.device) -> None:
+        """
+        :param device: Where observations and actions live from now on
+        """
+        moved = self._allocated and device != self.storage_device
+        state = self.__getstate__() if moved else {}
+        self.storage_device = device
+        if moved:
+            self._restore(state["saved_rows"], state["saved_positions"])
 
     def _observation_fields(self, name: str) -> Fields:
         space = self.observation_space
@@ -153,10 +179,11 @@ class TrajectoryReplayBuffer(ReplayBuffer):
     def __setstate__(self, state: dict[str, Any]) -> None:
         saved_rows, saved_positions = state.pop("saved_rows", None), state.pop("saved_positions", None)
         self.__dict__.update(state)
-        if self.storage_device.type == "cuda" and not th.cuda.is_available():
-            self.storage_device = th.device("cpu")  # saved on a larger machine
-        if not self._allocated:
-            return
+        self.storage_device = th.device("cpu")  # another machine may have no other
+        if self._allocated:
+            self._restore(saved_rows, saved_positions)
+
+    def _restore(self, saved_rows: list[np.ndarray], saved_positions: list[np.ndarray]) -> None:
         all_rows = self._all
         self._allocate()
         for part, records in zip(self._stored(), saved_rows, strict=True):
@@ -248,7 +275,6 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         self._running_length += 1
         self._running_return += reward
 
-        self._last_rows = rows
         self.just_finished = []
         for env in np.flatnonzero(done):
             if self.handle_timeout_termination:
@@ -338,7 +364,13 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         )
 
     def _on_device(self, fields: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
-        return {name: value.to(self.device, non_blocking=True) for name, value in fields.items()}
+        # Back to the main memory a copy must be waited for
+        wait = self.device.type == "cpu"
+        return {name: value.to(self.device, non_blocking=not wait) for name, value in fields.items()}
+
+    def _to_device(self, array: np.ndarray) -> th.Tensor:
+        """The same values on the device of the samples; not waited for."""
+        return th.from_numpy(array).to(self.device, non_blocking=True)
 
     def normalized(self, obs: Any, env: VecNormalize | None) -> Any:
         """

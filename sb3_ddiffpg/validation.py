@@ -35,7 +35,7 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
         (
             *("n_diffusion_steps", "n_action_gradient_steps", "n_critics", "n_atoms", "mode_n_steps", "exploration_n_steps"),
             *("recluster_freq", "max_modes", "min_mode_size", "max_successes_per_mode", "max_failures_per_mode"),
-            *("mode_embedding_dim", "mode_trials", "batch_size", "buffer_size"),
+            *("mode_embedding_dim", "mode_trials", "batch_size", "buffer_size", "n_steps"),
         ),
         "be an integer of at least 1",
         lambda value: _is_integer(value) and value >= 1,
@@ -84,30 +84,36 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
 )
 
 
-# Arguments of the policy that follow from those of the algorithm
-SET_BY_CONSTRUCTOR = (
-    *("n_modes", "n_diffusion_steps", "mode_embedding_dim", "n_critics", "n_atoms", "twin_target", "support"),
-    "exploration_support",
-)
-
-
-def check_arguments(model: Any) -> None:
+def check_arguments(model: Any, set_by_constructor: set[str]) -> None:
     """
-    :param model: A DDiffPG whose arguments are set
+    :param model: An algorithm whose arguments are set
+    :param set_by_constructor: Arguments of its policy that follow from its own
     :raises ValueError: For the first argument that cannot work
     """
     for names, accepted, is_right in RANGES:
         for name in names:
-            if not is_right(getattr(model, name)):
+            if hasattr(model, name) and not is_right(getattr(model, name)):
                 raise ValueError(f"{name} must {accepted}, got {getattr(model, name)!r}")
-    if model.n_steps != 1:
-        raise ValueError(f"n_steps={model.n_steps} is not supported: use mode_n_steps and exploration_n_steps instead")
     if model.optimize_memory_usage:
         raise ValueError("optimize_memory_usage=True is not supported: trajectories do not lie in one ring")
     given = model.replay_buffer_class
     if given is not None and not (isinstance(given, type) and issubclass(given, ModeReplayBuffer)):
         name = getattr(given, "__name__", repr(given))
         raise ValueError(f"replay_buffer_class must be ModeReplayBuffer or a subclass of it, got {name}")
+    overridden = {name for name in set_by_constructor if name in model.policy_kwargs}
+    if overridden:
+        raise ValueError(f"policy_kwargs must not hold {sorted(overridden)}: {type(model).__name__}'s own arguments say these")
+    if not model.v_min < model.v_max:
+        raise ValueError(f"v_min must be less than v_max, got v_min={model.v_min}, v_max={model.v_max}")
+
+
+def check_mode_arguments(model: Any) -> None:
+    """
+    :param model: A DDiffPG whose arguments are set
+    :raises ValueError: If its arguments on modes do not fit together
+    """
+    if model.n_steps != 1:
+        raise ValueError(f"n_steps={model.n_steps} is not supported: use mode_n_steps and exploration_n_steps instead")
     if model.batch_size < model.max_modes + 1:
         raise ValueError(
             f"batch_size={model.batch_size} is smaller than the number of groups it may be split over: "
@@ -118,8 +124,3 @@ def check_arguments(model: Any) -> None:
             f"max_successes_per_mode={model.max_successes_per_mode} is less than min_mode_size={model.min_mode_size}: "
             "no more trajectories than that would be remembered, and no mode ever be found"
         )
-    overridden = {name for name in SET_BY_CONSTRUCTOR if name in model.policy_kwargs}
-    if overridden:
-        raise ValueError(f"policy_kwargs must not hold {sorted(overridden)}: DDiffPG's own arguments say these")
-    if not model.v_min < model.v_max:
-        raise ValueError(f"v_min must be less than v_max, got v_min={model.v_min}, v_max={model.v_max}")

@@ -436,7 +436,7 @@ def test_goals_by_new_ways_are_worth_something_to_exploration():
         assert value == pytest.approx(expected), (obs[k], ends[k])
     assert (batch.new_ways > 0).any()
     buffer.add(*[np.full((1, 2), 7, np.float32)] * 2, np.zeros((1, 2)), np.zeros(1), np.zeros(1, bool), [{}])
-    assert buffer.way_novelty[buffer._last_rows[0]] == 0.0
+    assert buffer.way_novelty[buffer._running[0, 0]] == 0.0
 
 
 def test_a_mode_is_shown_a_foreign_trajectory_as_a_way_off_its_route():

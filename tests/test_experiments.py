@@ -48,3 +48,21 @@ def test_settings_that_do_not_exist(monkeypatch, tmp_path):
         record(monkeypatch, tmp_path, "--env", "PointMazeV9-v0")
     with pytest.raises(SystemExit, match="--env or --again"):
         record(monkeypatch, tmp_path)
+    with pytest.raises(SystemExit, match="folder of a recorded run"):
+        record(monkeypatch, tmp_path, "--again", str(tmp_path / "none"))
+    with pytest.raises(SystemExit, match="nope.*YAML file"):
+        record(monkeypatch, tmp_path, "--algo", "nope", "--env", "PointMazeV1-v0")
+    with pytest.raises(SystemExit, match="nope.*ddiffpg"):
+        record(monkeypatch, tmp_path, "--algo", "nope", "--conf-file", "ddiffpg", "--env", "PointMazeV1-v0")
+    with pytest.raises(SystemExit, match="registered"):
+        record(monkeypatch, tmp_path, "--env", "paper")
+    for override in ("5", "", "{"):
+        with pytest.raises(SystemExit):
+            record(monkeypatch, tmp_path, "--env", "PointMazeV1-v0", "--override", override)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_best_model_comes_with_its_normalisation(monkeypatch, tmp_path):
+    settings = SMALL.replace("1600", "1e3").replace("{", "{normalize: {norm_obs: true, norm_reward: false}, ")
+    done = record(monkeypatch, tmp_path / "run", "--env", "PointMazeV1-v0", "--override", settings)
+    assert done["result"]["complete"] and (tmp_path / "run" / "vecnormalize.pkl").is_file()

@@ -1,5 +1,6 @@
 """Rows in the main memory and on an accelerator hold the same; an update on the latter never waits for it."""
 
+import warnings
 from functools import partial
 
 import numpy as np
@@ -79,13 +80,42 @@ def test_other_observations_on_a_device(space, stored_on_device, tmp_path):
 
 
 def test_a_buffer_of_a_machine_with_an_accelerator_loads_without(tmp_path):
-    model = small_model(DummyVecEnv([TwoEnds] * 4), learning_starts=20)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sb3_ddiffpg.trajectory_buffer.make_rows", lambda n_rows, fields, device: ON_DEVICE(n_rows, fields))
+        model = small_model(DummyVecEnv([TwoEnds] * 4), learning_starts=20, device="cpu")
+        model.learn(100)
+        stored = model.replay_buffer.actions.numpy().copy()
+        model.replay_buffer.storage_device = th.device("cuda")
+        model.save_replay_buffer(tmp_path / "buffer")
+    model.replay_buffer.storage_device = th.device("cpu")
+    model.load_replay_buffer(tmp_path / "buffer")
+    assert isinstance(model.replay_buffer._steps, HostRows) and model.replay_buffer.size() >= 100
+    np.testing.assert_array_equal(model.replay_buffer.actions, stored)
+    model.learn(20, reset_num_timesteps=False)
+
+
+def test_rows_move_to_where_the_model_wants_them(monkeypatch):
+    model = small_model(DummyVecEnv([TwoEnds] * 4), learning_starts=20, device="cpu")
     model.learn(100)
-    model.replay_buffer.storage_device = th.device("cuda")
-    model.save_replay_buffer(tmp_path / "buffer")
-    if not th.cuda.is_available():
-        model.load_replay_buffer(tmp_path / "buffer")
-        assert isinstance(model.replay_buffer._steps, HostRows) and model.replay_buffer.size() >= 100
+    before = model.replay_buffer.actions.copy()
+    monkeypatch.setattr("sb3_ddiffpg.trajectory_buffer.make_rows", lambda n_rows, fields, device: ON_DEVICE(n_rows, fields))
+    model.replay_buffer.move_storage(th.device("meta"))
+    assert isinstance(model.replay_buffer._steps, DeviceRows)
+    np.testing.assert_array_equal(model.replay_buffer.actions.numpy(), before)
+    model.replay_buffer.reset()
+    assert not hasattr(model.replay_buffer, "_steps")  # the memory is free
+
+
+@pytest.mark.parametrize("device", ["auto", "cpu", "cuda"])
+def test_rows_are_only_where_the_samples_go(device):
+    env = DummyVecEnv([TwoEnds] * 4)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = small_model(env, device="cpu", replay_buffer_kwargs={"storage_device": device})
+    assert model.replay_buffer.storage_device == th.device("cpu")
+    assert any("main memory" in str(each.message) for each in caught) == (device == "cuda")
+    with pytest.raises(ValueError, match="storage_device"):
+        small_model(env, replay_buffer_kwargs={"storage_device": None})
 
 
 class NoWaiting(TorchDispatchMode):
@@ -104,6 +134,7 @@ class NoWaiting(TorchDispatchMode):
 def test_an_update_never_waits_for_the_device(settings, stored_on_device, monkeypatch):
     model = small_model(DummyVecEnv([TwoEnds] * 4), learning_starts=20, **settings)
     model.learn(200)
+    model.train(1, 48)  # what is made once, is made now
     assert len(model.modes) >= 1
 
     def refuse(*_, **__):
@@ -112,12 +143,16 @@ def test_an_update_never_waits_for_the_device(settings, stored_on_device, monkey
     monkeypatch.setattr("sb3_ddiffpg.critics.LARGE_ASCENT", 10**9)
     model.replay_buffer.storage_device = th.device("cuda")  # only asked whether target actions must come back
     metrics = {name: [] for name in ("intrinsic_reward", "novelty_loss")}
-    batch = model.replay_buffer.sample_modes(48, model.gamma, 3, 5)
+    if "mode_intrinsic_coef" in settings:
+        model.replay_buffer.expect_modes(len(model.modes))  # modes without transitions
     for method in ("cpu", "numpy", "item", "tolist", "__bool__", "__float__", "__int__"):
         monkeypatch.setattr(th.Tensor, method, refuse)
+    for function in ("tensor", "as_tensor"):  # they copy from memory that a device cannot read by itself
+        monkeypatch.setattr(th, function, refuse)
     with NoWaiting():
+        batch = model.replay_buffer.sample_modes(48, model.gamma, 3, 5)
         rewards = model._rewards(batch, metrics)
         model._update_critics(batch, rewards)
         improved = model._improve_target_actions(batch)
-        model._update_actor(batch, improved)
+        model._update_policy(batch, improved)
         model._update_targets()

@@ -89,7 +89,7 @@ def test_groups_without_data_train_nothing(tmp_path):
         th.manual_seed(0)
         model._update_critics(each, each.rewards)
         improved = model._improve_target_actions(each)
-        model._update_actor(each, improved)
+        model._update_policy(each, improved)
         updated.append((parameters_of(model.critics), parameters_of(model.actor)))
     (critics, actor), (other_critics, other_actor) = updated
     assert all(th.equal(first, second) for first, second in zip(critics + actor, other_critics + other_actor, strict=True))
@@ -115,7 +115,7 @@ def test_the_policy_does_not_imitate_foreign_trajectories():
     for changed in (np.zeros_like(foreign), foreign, ~foreign):
         model.set_parameters(start)
         th.manual_seed(0)
-        model._update_actor(batch, th.where(th.as_tensor(changed)[..., None], -batch.target_actions, batch.target_actions))
+        model._update_policy(batch, th.where(th.as_tensor(changed)[..., None], -batch.target_actions, batch.target_actions))
         updated.append(parameters_of(model.actor))
     same = [all(th.equal(a, b) for a, b in zip(updated[0], other, strict=True)) for other in updated[1:]]
     assert same == [True, False]

@@ -8,8 +8,10 @@ and to repeat a recorded one ``python -m sb3_ddiffpg.experiments.run --again res
 
 import argparse
 import csv
+import importlib
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import time
@@ -19,11 +21,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import torch as th
 import yaml
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_ddiffpg.callbacks import EvaluateModesCallback
-from sb3_ddiffpg.envs import is_ours, make_vec_env
+from sb3_ddiffpg.envs import is_ours
 from sb3_ddiffpg.evaluation import evaluate_modes
 from sb3_ddiffpg.trajectories import read_success
 from sb3_ddiffpg.zoo import ALGO, ALGOS, ModeExperimentManager, config_file, register
@@ -98,7 +102,6 @@ def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: 
     """
     if (folder / "config.yml").exists():
         raise SystemExit(f"--out: {folder} holds a run already; accepted is a folder without one")
-    register()
     (folder / "logs").mkdir(parents=True, exist_ok=True)
     entry = folder / "logs" / "hyperparams.yml"
     entry.write_text(yaml.safe_dump({env_id: hyperparams}))
@@ -129,13 +132,19 @@ def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: 
         "machine": _machine(),
         "versions": _versions(),
     }
+    # One fixed start, for the tasks that have start noise
+    manager.eval_env_kwargs = {**manager.env_kwargs, **({"start_noise": 0.0} if is_ours(env_id) else {})}
+    test_env = manager.create_envs(N_TEST_EPISODES, eval_env=True)
+    test_env.seed(seed + 500)
+    curve = CurveCallback(
+        folder, eval_env=test_env, eval_freq=max(1, manager.n_timesteps // N_TESTS), n_episodes=N_TEST_EPISODES
+    )
+    manager.callbacks.insert(0, curve)  # the zoo tells the first one when it was interrupted
     (folder / "config.yml").write_text(yaml.safe_dump(record, sort_keys=False))
-    test_env = _test_env(env_id, manager.env_kwargs, seed)
-    curve = CurveCallback(folder, eval_env=test_env, eval_freq=manager.n_timesteps // N_TESTS, n_episodes=N_TEST_EPISODES)
-    manager.callbacks.append(curve)
     started, cpu = time.perf_counter(), time.process_time()
     manager.learn(model)
     record["result"] = {
+        "complete": model.num_timesteps >= manager.n_timesteps,
         "steps": model.num_timesteps,
         "updates": model._n_updates,
         "hours": round((time.perf_counter() - started) / 3600, 3),
@@ -144,17 +153,23 @@ def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: 
     }
     (folder / "config.yml").write_text(yaml.safe_dump(record, sort_keys=False))
     model.save(folder / "logs" / "final_model.zip")
+    if curve.best_step is None:
+        shutil.copy(folder / "logs" / "final_model.zip", folder / "model.zip")
     for name, path in (("final", folder / "logs" / "final_model.zip"), ("best", folder / "model.zip")):
-        found = evaluate_modes(ALGOS[algo].load(path), test_env, N_EPISODES, seed=seed + 1_000)
+        statistics = path.with_name("vecnormalize.pkl")
+        env = VecNormalize.load(str(statistics), unwrap(test_env)) if name == "best" and statistics.exists() else test_env
+        found = evaluate_modes(ALGOS[algo].load(path), env, N_EPISODES, seed=seed + 1_000)
         found.save(folder / ("evaluation.json" if name == "best" else "logs/evaluation_final.json"))
         print(f"\n{name} model\n{found}")
     test_env.close()
 
 
-def _test_env(env_id: str, env_kwargs: dict[str, Any], seed: int) -> Any:
-    """One fixed start, for the tasks that have start noise."""
-    fixed = {"start_noise": 0.0} if is_ours(env_id) else {}
-    return make_vec_env(env_id, N_TEST_EPISODES, seed=seed + 500, **{**env_kwargs, **fixed})
+def unwrap(env: VecEnv) -> VecEnv:
+    """
+    :param env: Environments
+    :return: Those that its outermost ``VecNormalize`` normalises, else the same
+    """
+    return env.venv if isinstance(env, VecNormalize) else env
 
 
 def _git_commit() -> str | None:
@@ -202,24 +217,58 @@ def main() -> None:
     parser.add_argument("--algo", default=ALGO)
     parser.add_argument("--env")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--conf-file", default=ALGO, help="a YAML file as the zoo's, or the name of one of ours")
-    parser.add_argument("--override", type=yaml.safe_load, default={}, help="settings as YAML, such as '{n_timesteps: 1e5}'")
+    parser.add_argument(
+        "--conf-file", help="a YAML file as the zoo's, or the name of one of ours; the algorithm's own if not given"
+    )
+    parser.add_argument("--override", type=_settings, default={}, help="settings as YAML, such as '{n_timesteps: 1e5}'")
     parser.add_argument("--again", type=Path, help="folder of a recorded run: same algorithm, environment, seed and settings")
     parser.add_argument("--out", type=Path, required=True, help="folder for the record")
     given = parser.parse_args()
+    if (given.env is None) == (given.again is None):
+        raise SystemExit("--env or --again is needed, and not both")
+    register()
     if given.again is not None:
-        recorded = yaml.safe_load((given.again / "config.yml").read_text())
+        path = given.again / "config.yml"
+        if not path.is_file():
+            raise SystemExit(f"--again: {given.again} given; accepted is the folder of a recorded run, with a config.yml")
+        recorded = yaml.safe_load(path.read_text())
         algo, env_id, seed, hyperparams = (recorded[key] for key in ("algo", "env", "seed", "hyperparams"))
-    elif given.env is not None:
+    else:
         algo, env_id, seed = given.algo, given.env, given.seed
-        path = config_file(given.conf_file) or Path(given.conf_file)
+        path = config_file(given.conf_file or algo) or Path(given.conf_file or algo)
+        if not path.is_file():
+            raise SystemExit(f"--conf-file: {given.conf_file!r} given for --algo {algo}; accepted is a YAML file")
         entries = yaml.safe_load(path.read_text())
         if env_id not in entries:
             raise SystemExit(f"--env: {env_id!r} given; {path.name} has settings for {', '.join(sorted(entries))}")
         hyperparams = entries[env_id]
-    else:
-        raise SystemExit("--env or --again is needed")
-    run(algo, env_id, seed, {**hyperparams, **given.override}, given.out)
+    if algo not in ALGOS:
+        raise SystemExit(f"--algo: {algo!r} given; accepted are {', '.join(sorted(ALGOS))}")
+    if env_id not in gym.registry:
+        gym.register_envs(importlib.import_module("gymnasium_robotics"))
+    if env_id not in gym.registry:
+        raise SystemExit(f"--env: {env_id!r} given; accepted is the id of a registered environment")
+    merged = {**hyperparams, **given.override}
+    run(algo, env_id, seed, {name: _number(value) for name, value in merged.items()}, given.out)
+
+
+def _settings(text: str) -> dict[str, Any]:
+    """Of ``--override``."""
+    try:
+        settings = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no YAML: {error}") from None
+    if not isinstance(settings, dict):
+        raise argparse.ArgumentTypeError(f"{text!r} given; accepted are settings as '{{name: value}}'")
+    return settings
+
+
+def _number(value: Any) -> Any:
+    """YAML reads 1e5 as a string."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
 
 
 if __name__ == "__main__":

@@ -1,0 +1,497 @@
+"""What all actor-critic algorithms of this package share: distributional twin critics, novelty, and the loop around them."""
+
+import warnings
+from collections import defaultdict
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from scipy.signal import lfilter
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
+from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
+from stable_baselines3.common.vec_env import VecEnv
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+
+from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
+from sb3_ddiffpg.critics import ModeCritics
+from sb3_ddiffpg.features import declared_cell_size, declared_mode_features, describe_env
+from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, noveld_reward
+from sb3_ddiffpg.noise import SpreadNormalActionNoise
+from sb3_ddiffpg.trajectories import Trajectory
+from sb3_ddiffpg.twin_critic_policy import TwinCriticPolicy
+from sb3_ddiffpg.validation import check_arguments
+from sb3_ddiffpg.visits import VisitMap
+
+SelfActorCritic = TypeVar("SelfActorCritic", bound="NoveltyActorCritic")
+
+
+class NoveltyActorCritic(OffPolicyAlgorithm):
+    """
+    Off-policy actor-critic with distributional twin critics, whose reward is the environment's and NovelD's
+    (Zhang et al., 2021). A subclass says in ``_update_actor`` how its actor learns.
+
+    :param policy: See the subclass
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param learning_rate: Learning rate of the actor, a float or a function of the remaining progress (from 1 to 0)
+    :param buffer_size: Capacity of the replay buffer in transitions, over all environments
+    :param learning_starts: Steps of random actions before learning starts
+    :param batch_size: Transitions per update
+    :param tau: Soft update coefficient of the target critics
+    :param gamma: Discount factor
+    :param train_freq: Update the model every ``train_freq`` steps (of all environments), or a tuple with the unit
+    :param gradient_steps: Updates after each rollout; -1: as many as transitions were collected
+    :param action_noise: Exploration noise; None: Gaussian, its standard deviation drawn per episode from [.05, .6]
+    :param replay_buffer_class: ``ModeReplayBuffer`` or a subclass of it
+    :param replay_buffer_kwargs: Further keyword arguments of the replay buffer
+    :param optimize_memory_usage: Not supported
+    :param n_steps: Length of the multi-step returns (uncorrected)
+    :param qf_learning_rate: Learning rate of the critics, like ``learning_rate``; the same as it when None
+    :param n_critics: Critics, the minimum over them is used
+    :param n_atoms: Atoms of the critics' value distribution (C51); 1 for scalar critics
+    :param twin_target: See ``ModeCritics``
+    :param v_min: Lower end of the values' support
+    :param v_max: Upper end of the support
+    :param reward_scale: Factor on the environment's reward
+    :param target_policy_noise: Standard deviation of the noise on the actions in the Bellman target
+    :param target_noise_clip: Limit of that noise
+    :param mode_features: See ``DDiffPG``; here novelty is measured in them
+    :param success_key: Key of ``info`` that marks a success, see ``ModeReplayBuffer``
+    :param novelty: ``"rnd"``, ``"counts"``, or a class with the methods of ``RandomNetworkDistillation``
+    :param novelty_kwargs: Further keyword arguments of the novelty measure
+    :param novelty_scale: The factor alpha of NovelD
+    :param intrinsic_coef: Factor c on the intrinsic reward
+    :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation
+    :param max_grad_norm: Largest gradient norm of the actor and of each group's critics
+    :param stats_window_size: Window size for the rollout logging
+    :param tensorboard_log: The log location for tensorboard (if None, no logging)
+    :param policy_kwargs: Additional arguments of the policy
+    :param verbose: 0: no output, 1: info messages, 2: debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device on which the code should run; "auto" uses the GPU if possible
+    :param _init_setup_model: Whether to build the networks at the creation of the instance
+    :raises ValueError: If an argument is out of its range, naming it
+    """
+
+    default_replay_buffer_class: ClassVar[type[ModeReplayBuffer]] = ModeReplayBuffer
+    policy: TwinCriticPolicy
+    actor: Any
+    replay_buffer: ModeReplayBuffer
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 500_000,
+        learning_starts: int = 1_000,
+        batch_size: int = 256,
+        tau: float = 0.05,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ModeReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        qf_learning_rate: float | Schedule | None = None,
+        n_critics: int = 2,
+        n_atoms: int = 51,
+        twin_target: str = "lower_mean",
+        v_min: float = 0.0,
+        v_max: float = 5.0,
+        reward_scale: float = 1.0,
+        target_policy_noise: float = 0.8,
+        target_noise_clip: float = 0.2,
+        mode_features: Any = None,
+        success_key: str | None = None,
+        novelty: str | type = "counts",
+        novelty_kwargs: dict[str, Any] | None = None,
+        novelty_scale: float = 0.5,
+        intrinsic_coef: float = 0.05,
+        normalize_intrinsic: bool = True,
+        max_grad_norm: float = 1.0,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+            support_multi_env=True,
+        )
+        # Not handed on: SB3 would make a buffer of its own for it
+        self.n_steps = n_steps
+        self.qf_learning_rate = qf_learning_rate
+        self.n_critics = n_critics
+        self.n_atoms = n_atoms
+        self.twin_target = twin_target
+        self.v_min = v_min
+        self.v_max = v_max
+        self.reward_scale = reward_scale
+        self.target_policy_noise = target_policy_noise
+        self.target_noise_clip = target_noise_clip
+        self.mode_features = mode_features
+        self.success_key = success_key
+        self.novelty = novelty
+        self.novelty_kwargs = novelty_kwargs
+        self.novelty_scale = novelty_scale
+        self.intrinsic_coef = intrinsic_coef
+        self.normalize_intrinsic = normalize_intrinsic
+        self.max_grad_norm = max_grad_norm
+
+        self.is_normalized = False
+        self.visits: VisitMap | None = None
+        self.env_spec: str | None = None
+        self._resolved_features: Any = None
+        self._warned_support = False
+
+        if _init_setup_model:
+            self._setup_model()
+
+    # ------------------------------------------------------------------ set-up
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        """What the algorithm's own arguments say about the policy."""
+        support = (self.v_min, self.v_max)
+        return {
+            "n_critics": self.n_critics,
+            "n_atoms": self.n_atoms,
+            "twin_target": self.twin_target,
+            "support": support,
+            "exploration_support": support,
+        }
+
+    def _buffer_arguments(self) -> dict[str, Any]:
+        """What they say about the replay buffer."""
+        return {"mode_features": self._resolved_features, "success_key": self.success_key}
+
+    def _check_arguments(self) -> None:
+        check_arguments(self, set(self._policy_arguments()))
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = self.default_replay_buffer_class
+        self._resolve_mode_features()
+        given = self.policy_kwargs, self.replay_buffer_kwargs, self.n_steps
+        # Not stored in the model: what the user gave is what ``load`` compares and ``save`` keeps
+        self.policy_kwargs = {**self._policy_arguments(), **self.policy_kwargs}
+        self.replay_buffer_kwargs = {**self._buffer_arguments(), **self.replay_buffer_kwargs}
+        self.n_steps = 1  # for more, SB3 would want a buffer of its own
+        try:
+            super()._setup_model()
+        finally:
+            self.policy_kwargs, self.replay_buffer_kwargs, self.n_steps = given
+        noise = self.action_noise
+        if noise is None or (isinstance(noise, SpreadNormalActionNoise) and noise.shape[0] != self.n_envs):
+            # None given, or loaded with another number of environments
+            deviations = {} if noise is None else {"low": noise.low, "high": noise.high}
+            action_dim = int(np.prod(self.action_space.shape or (1,)))
+            self.action_noise = SpreadNormalActionNoise(self.n_envs, action_dim, **deviations)
+        if self.visits is None and self.replay_buffer.features.dim <= 3:
+            self.visits = VisitMap(self.replay_buffer.features.dim, declared_cell_size(self.env))
+        if self.env is not None:
+            self.env_spec = describe_env(self.env)
+            self.is_normalized = self._vec_normalize_env is not None
+        measure = NOVELTY_MEASURES[self.novelty] if isinstance(self.novelty, str) else self.novelty
+        self.novelty_model: Any = measure(
+            self.replay_buffer.features.dim, self.policy.actor.features_dim, **(self.novelty_kwargs or {})
+        ).to(self.device)
+        self.intrinsic_moments = RunningMoments(1, max_count=100_000).to(self.device)
+        self._qf_schedule = self.lr_schedule if self.qf_learning_rate is None else FloatSchedule(self.qf_learning_rate)
+        self._create_aliases()
+
+    def _resolve_mode_features(self) -> None:
+        if self.mode_features is not None:
+            self._resolved_features = self.mode_features
+        elif self.env is not None:
+            self._resolved_features = declared_mode_features(self.env)
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+
+    @property
+    def critics(self) -> ModeCritics:
+        """The critics of all groups, see ``critics.ModeCritics``."""
+        return self.policy.critics
+
+    # ------------------------------------------------------------------ learning
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """
+        :param gradient_steps: Number of updates
+        :param batch_size: Transitions per update
+        """
+        self._begin_updates()
+        metrics: dict[str, list[th.Tensor]] = defaultdict(list)
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample_modes(batch_size, self.gamma, self.n_steps, 1, env=self._vec_normalize_env)
+            intrinsic = self._intrinsic_rewards(batch.windows[..., : self.n_steps], metrics)
+            rewards = self.reward_scale * batch.rewards + intrinsic
+            metrics["critic_loss"].append(self._update_critics(batch, rewards))
+            self._update_actor(batch, metrics)
+            self._update_targets()
+        self._end_updates(gradient_steps, metrics)
+
+    def _begin_updates(self) -> None:
+        self.policy.set_training_mode(True)
+        self._update_learning_rates()
+
+    def _end_updates(self, gradient_steps: int, metrics: dict[str, list[th.Tensor]]) -> None:
+        self._n_updates += gradient_steps
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, values in metrics.items():
+            self.logger.record(f"train/{name}", th.stack(values).mean().item())
+
+    def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
+        """
+        One step of the actor.
+
+        :param batch: A batch of one group
+        :param metrics: Where to note its loss
+        """
+        raise NotImplementedError
+
+    def _next_actions(self, batch: ModeBatch) -> tuple[th.Tensor, th.Tensor | float]:
+        """
+        :param batch: The batch
+        :return: The policy's actions at the next observations, [N, action_dim], and what it adds to the value there, such as
+            entropy, [G, n]
+        """
+        return self.actor(batch.next_observations), 0.0
+
+    def _intrinsic_rewards(self, windows: np.ndarray, metrics: dict[str, list[th.Tensor]]) -> th.Tensor:
+        """
+        Discounted NovelD rewards over windows of consecutive rows, followed by one step of the novelty measure.
+
+        :param windows: Rows, [G, n, n_steps], -1 beyond a window's end
+        :param metrics: Where to note the mean and the loss
+        :return: [G, n]
+        """
+        present = windows >= 0
+        inputs = [self._novelty_inputs(obs) for obs in self.replay_buffer.read_observations(windows[present])]
+        now, then = (self.novelty_model.novelty(*each) for each in inputs)
+        reward = noveld_reward(now, then, self.novelty_scale)
+        metrics["intrinsic_reward"].append(reward.mean())
+        if self.normalize_intrinsic:
+            self.intrinsic_moments.update(reward[:, None])
+            # Not centred: where nothing is new, a negative reward would make it worth while to end the episode at a goal.
+            # Limited: one surprising state would dominate the values for long
+            reward = (reward / (self.intrinsic_moments.var.sqrt() + 1e-8)).clamp(max=10.0)
+        if self.novelty_model.optimizer is not None:
+            metrics["novelty_loss"].append(self.novelty_model.update(*inputs[1]))
+        places = th.from_numpy(np.flatnonzero(present)).to(self.device, non_blocking=True)
+        rewards = reward.new_zeros(windows.size).index_copy(0, places, reward).view(windows.shape)
+        discounts = self.gamma ** th.arange(windows.shape[-1], device=self.device)
+        return self.intrinsic_coef * (rewards * discounts).sum(dim=-1).float()
+
+    def _novelty_inputs(self, obs: Any) -> tuple[th.Tensor, th.Tensor]:
+        """Positions [N, position_dim] and scaled features [N, features_dim] of observations, not normalised, on the device."""
+        positions = self.replay_buffer.features.of_tensors(obs)
+        if not getattr(self.novelty_model, "with_observation", False):
+            return positions, positions
+        obs = self.replay_buffer.normalized(obs, self._vec_normalize_env)
+        with th.no_grad():
+            return positions, self.actor.extract_features(obs, self.actor.features_extractor)
+
+    def _update_critics(self, batch: ModeBatch, rewards: th.Tensor) -> th.Tensor:
+        policy, shape = self.policy, batch.actions.shape
+        with th.no_grad():
+            next_actions, bonus = self._next_actions(batch)
+            noise = (th.randn_like(next_actions) * self.target_policy_noise).clamp(
+                -self.target_noise_clip, self.target_noise_clip
+            )
+            next_actions = (next_actions + noise).clamp(-1.0, 1.0).view(shape)
+            next_features = policy.critic_features(batch.next_observations, target=True)
+            rewards = rewards + batch.discounts * bonus
+            targets = policy.critics_target.bellman_target(next_features, next_actions, rewards, batch.discounts)
+        losses = policy.critics.loss(policy.critic_features(batch.observations), batch.actions, targets)
+        policy.critics.optimizer.zero_grad(set_to_none=True)
+        (losses * batch.active).sum().backward()
+        policy.critics.clip_gradients(self.max_grad_norm)
+        policy.critics.optimizer.step()
+        return losses.detach().mean()
+
+    def _update_targets(self) -> None:
+        policy = self.policy
+        online = [*policy.critics.parameters(), *policy.critic_features_extractor.parameters()]
+        targets = [*policy.critics_target.parameters(), *policy.critic_features_extractor_target.parameters()]
+        # Polyak averaging, in one kernel
+        get_ema_multi_avg_fn(1 - self.tau)(targets, online, None)
+        # Running statistics of a batch norm are copied, as in SB3
+        statistics = policy.critic_features_extractor.buffers(), policy.critic_features_extractor_target.buffers()
+        for current, target in zip(*statistics, strict=True):
+            target.copy_(current)
+
+    def _update_learning_rates(self) -> None:
+        progress = self._current_progress_remaining
+        for name, optimizer, schedule in (
+            ("learning_rate", self.actor.optimizer, self.lr_schedule),
+            ("qf_learning_rate", self.policy.critics.optimizer, self._qf_schedule),
+        ):
+            self.logger.record(f"train/{name}", schedule(progress))
+            update_learning_rate(optimizer, schedule(progress))
+
+    # ------------------------------------------------------------------ acting
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        assert self._last_obs is not None, "self._last_obs was not set"
+        # Before the environments are given an action that follows from NaN
+        self.replay_buffer.check_finite("observation", self._last_obs)
+        shape = (n_envs, *self.action_space.shape)  # type: ignore[misc]
+        if self.num_timesteps < learning_starts:
+            scaled_action = np.random.uniform(-1.0, 1.0, size=shape).astype(np.float32)
+        else:
+            scaled_action = self.policy.scale_action(self._training_actions())
+            if action_noise is not None:
+                scaled_action = np.clip(scaled_action + action_noise().reshape(shape), -1.0, 1.0)
+            self.replay_buffer.check_finite("policy's action (has training diverged?)", scaled_action)
+        return self.policy.unscale_action(scaled_action), scaled_action
+
+    def _training_actions(self) -> np.ndarray:
+        """The policy's actions at the latest observations, before exploration noise."""
+        return self.policy.predict(self._last_obs)[0]  # type: ignore[arg-type]
+
+    def _store_transition(self, replay_buffer: ModeReplayBuffer, *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
+        super()._store_transition(replay_buffer, *args, **kwargs)
+        positions = replay_buffer.last_positions()
+        self.novelty_model.observe(th.as_tensor(positions, device=self.device))
+        if self.visits is not None:
+            self.visits.observe(positions)
+        for _, trajectory in replay_buffer.just_finished:
+            self._warn_outside_support(trajectory)
+
+    def _warn_outside_support(self, trajectory: Trajectory) -> None:
+        """Once: values that the critics cannot represent make all actions look alike."""
+        if self._warned_support:
+            return
+        rewards = self.reward_scale * self.replay_buffer.rewards[trajectory.rows]
+        returns = lfilter([1.0], [1.0, -self.gamma], rewards[::-1])
+        if returns.max() > self.v_max + 1e-6 or returns.min() < self.v_min - 1e-6:
+            self._warned_support = True
+            warnings.warn(
+                f"A discounted return between {returns.min():.4g} and {returns.max():.4g} leaves the critics' support "
+                f"[v_min={self.v_min}, v_max={self.v_max}] and is clipped: adapt v_min, v_max or reward_scale"
+            )
+
+    # ------------------------------------------------------------------ a run's beginning and end
+
+    def learn(
+        self: SelfActorCritic,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 100,
+        tb_log_name: str = "run",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfActorCritic:
+        """
+        Train the model. See SB3's ``learn``; ``log_interval`` counts episodes of all environments.
+        """
+        # Denormal numbers in Adam's moments slow a small update down by half
+        th.set_flush_denormal(True)
+        try:
+            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        finally:
+            th.set_flush_denormal(False)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        assert self.env is not None, "You must set the environment before calling learn()"
+        self._check_buffer(self.env)
+        if self._vec_normalize_env is not None and self._vec_normalize_env.norm_reward:
+            warnings.warn(
+                "VecNormalize scales the rewards (norm_reward=True), and so the values, which the critics' support "
+                f"[v_min={self.v_min}, v_max={self.v_max}] must cover; norm_reward=False leaves them in reward units"
+            )
+        new_episodes = reset_num_timesteps or self._last_obs is None
+        if new_episodes:
+            self.replay_buffer.drop_unfinished_episodes()
+        total_timesteps, callback = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        # What an earlier run left behind would end the exploration of this one's first episodes
+        self._update_current_progress_remaining(self.num_timesteps, max(total_timesteps, 1))
+        if new_episodes:
+            self._begin_episodes()
+        return total_timesteps, callback
+
+    def _begin_episodes(self) -> None:
+        """All environments have been reset."""
+
+    def _check_buffer(self, env: VecEnv) -> None:
+        """The episodes in progress must fit, or hours later there would be nothing to evict."""
+        if self.replay_buffer.n_envs != self.n_envs:
+            raise ValueError(f"The replay buffer was made for {self.replay_buffer.n_envs} environment(s), got {self.n_envs}")
+        try:
+            limit = getattr(env.get_attr("spec", indices=0)[0], "max_episode_steps", None)
+        except AttributeError:
+            return
+        if limit is not None and self.replay_buffer.buffer_size < limit * self.n_envs:
+            raise ValueError(
+                f"buffer_size={self.replay_buffer.buffer_size} is smaller than one episode of every environment: "
+                f"{self.n_envs} x {limit} steps"
+            )
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """
+        See SB3. A callback that stops the training makes SB3 drop the last transition (its issue 2056), and so does an error
+        or an interrupt: the next ``learn`` then resets the environments, or the running trajectories would have a gap.
+        """
+        complete = False
+        try:
+            rollout = super().collect_rollouts(*args, **kwargs)
+            complete = rollout.continue_training
+        finally:
+            if not complete:
+                self._last_obs = None
+        return rollout
+
+    # ------------------------------------------------------------------ saving
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names = ["policy", "actor.optimizer", "policy.critics.optimizer", "novelty_model", "intrinsic_moments"]
+        if self.novelty_model.optimizer is not None:
+            names.append("novelty_model.optimizer")
+        return names, []
