@@ -1,6 +1,7 @@
 """Diffusion model over actions: noise schedule, denoiser, ancestral sampling and denoising loss (Ho et al., 2020)."""
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 
 import torch as th
@@ -18,6 +19,22 @@ def squared_cosine_betas(n_steps: int, max_beta: float = 0.999) -> th.Tensor:
     time = th.arange(n_steps + 1, dtype=th.float64) / n_steps
     alpha_bar = th.cos((time + 0.008) / 1.008 * math.pi / 2) ** 2
     return (1 - alpha_bar[1:] / alpha_bar[:-1]).clamp(max=max_beta)
+
+
+def variance_preserving_betas(n_steps: int, low: float = 0.1, high: float = 10.0) -> th.Tensor:
+    """
+    Discretised variance-preserving schedule (Xiao et al., 2022), which Diffusion-QL uses.
+
+    :param n_steps: Number of diffusion steps T
+    :param low: Rate of the noise at the beginning
+    :param high: Rate at the end
+    :return: Variances beta_0..beta_{T-1}, shape [T], float64
+    """
+    time = th.arange(1, n_steps + 1, dtype=th.float64)
+    return 1 - th.exp(-low / n_steps - 0.5 * (high - low) * (2 * time - 1) / n_steps**2)
+
+
+NOISE_SCHEDULES: dict[str, Callable[[int], th.Tensor]] = {"cosine": squared_cosine_betas, "vp": variance_preserving_betas}
 
 
 class SinusoidalEmbedding(nn.Module):
@@ -115,17 +132,21 @@ class DiffusionModel(nn.Module):
 
     :param denoiser: The noise predictor
     :param n_steps: Number of diffusion steps T
+    :param noise_schedule: One of ``NOISE_SCHEDULES``
+    :raises ValueError: If there is no such schedule
     """
 
     alpha_bar: th.Tensor
     sqrt_alpha_bar: th.Tensor
     sqrt_one_minus_alpha_bar: th.Tensor
 
-    def __init__(self, denoiser: Denoiser, n_steps: int) -> None:
+    def __init__(self, denoiser: Denoiser, n_steps: int, noise_schedule: str = "cosine") -> None:
         super().__init__()
         self.denoiser = denoiser
         self.n_steps = n_steps
-        betas = squared_cosine_betas(n_steps)
+        if noise_schedule not in NOISE_SCHEDULES:
+            raise ValueError(f"noise_schedule must be one of {list(NOISE_SCHEDULES)}, got {noise_schedule!r}")
+        betas = NOISE_SCHEDULES[noise_schedule](n_steps)
         alpha_bar = th.cumprod(1 - betas, dim=0)
         previous = th.cat((th.ones(1, dtype=th.float64), alpha_bar[:-1]))
         # Python floats: the loop over T steps then launches no kernels to look them up
@@ -140,7 +161,19 @@ class DiffusionModel(nn.Module):
     @th.no_grad()
     def sample(self, condition: th.Tensor, deterministic: bool = False, noise: th.Tensor | None = None) -> th.Tensor:
         """
-        Draw actions by ancestral sampling (Ho et al., 2020, algorithm 2).
+        As ``denoise``, without gradients.
+
+        :param condition: Shape [N, condition_dim]
+        :param deterministic: See ``denoise``
+        :param noise: See ``denoise``
+        :return: Actions in [-1, 1], shape [N, action_dim]
+        """
+        return self.denoise(condition, deterministic, noise)
+
+    def denoise(self, condition: th.Tensor, deterministic: bool = False, noise: th.Tensor | None = None) -> th.Tensor:
+        """
+        Draw actions by ancestral sampling (Ho et al., 2020, algorithm 2). Gradients reach the condition and the denoiser, but
+        not where an action is cut at its bounds.
 
         :param condition: Shape [N, condition_dim]
         :param deterministic: Start from a zero latent and follow the posterior means, without any noise

@@ -376,7 +376,7 @@ def _labels(model: Any, runs: list[list[EpisodeResult]]) -> tuple[list[list[str 
     buffer = getattr(model, "replay_buffer", None)
     if isinstance(buffer, ModeReplayBuffer) and (buffer.size() or not buffer.features.whole_observation):
         paths = [buffer.resample(episode.path) for episode in successes]
-        normalize, linkage = buffer.normalize_distances, model.linkage
+        normalize, linkage = buffer.normalize_distances, getattr(model, "linkage", "average")
     else:
         full = [episode.path for episode in successes]
         if full[0].shape[1] > 3:  # a whole observation, whose components have scales of their own

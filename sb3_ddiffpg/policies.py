@@ -30,6 +30,7 @@ class DiffusionActor(BasePolicy):
     :param mode_embedding_dim: Size of a mode embedding
     :param time_embedding_dim: Size of a diffusion step's embedding
     :param normalize_images: Whether images are divided by 255
+    :param noise_schedule: See ``diffusion.DiffusionModel``
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class DiffusionActor(BasePolicy):
         mode_embedding_dim: int = 5,
         time_embedding_dim: int = 32,
         normalize_images: bool = True,
+        noise_schedule: str = "cosine",
     ) -> None:
         super().__init__(
             observation_space,
@@ -63,7 +65,8 @@ class DiffusionActor(BasePolicy):
             activation_fn=activation_fn,
             time_embedding_dim=time_embedding_dim,
         )
-        self.diffusion = DiffusionModel(denoiser, n_diffusion_steps)
+        self.noise_schedule = noise_schedule
+        self.diffusion = DiffusionModel(denoiser, n_diffusion_steps, noise_schedule)
         self.optimizer: th.optim.Optimizer
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -76,6 +79,7 @@ class DiffusionActor(BasePolicy):
             mode_embedding_dim=self.mode_embedding_dim,
             time_embedding_dim=self.time_embedding_dim,
             features_extractor=self.features_extractor,
+            noise_schedule=self.noise_schedule,
         )
         return data
 

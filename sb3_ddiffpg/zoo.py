@@ -23,6 +23,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.callbacks import ModeEvalCallback
 from sb3_ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import is_ours, make_vec_env
@@ -60,12 +61,14 @@ COMMAND_LINE_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "
 
 def register() -> None:
     """
-    Make DDiffPG known to the zoo, with its sampler for Optuna and the :class:`ModeExperimentManager`. Call it before
-    the zoo's functions; they read the names of the algorithms when they start.
+    Make DDiffPG and the baselines known to the zoo, with their samplers for Optuna and the :class:`ModeExperimentManager`.
+    Call it before the zoo's functions; they read the names of the algorithms when they start.
     """
     ALGOS[ALGO] = DDiffPG
-    HYPERPARAMS_SAMPLER[ALGO] = sample_ddiffpg_params
-    HYPERPARAMS_CONVERTER[ALGO] = convert_ddiffpg_params
+    ALGOS.update(BASELINES)
+    for name in (ALGO, *BASELINES):
+        HYPERPARAMS_SAMPLER[name] = partial(sample_params, name)
+        HYPERPARAMS_CONVERTER[name] = convert_params
     rl_zoo3.train.ExperimentManager = ModeExperimentManager  # type: ignore[misc]
     rl_zoo3.exp_manager.EvalCallback = ModeEvalCallback  # type: ignore[misc, assignment]
 
@@ -91,7 +94,15 @@ def check_hyperparameters(algo: str, keys: Sequence[str]) -> None:
     :raises TypeError: If one is neither a key of the zoo nor an argument of the algorithm. Not a ValueError: the zoo
         takes those for an unlucky trial when it optimises.
     """
-    arguments = set(inspect.signature(ALGOS[algo].__init__).parameters) - COMMAND_LINE_ARGUMENTS
+    # A constructor with **kwargs hands them on to the one above it
+    arguments: set[str] = set()
+    for each in ALGOS[algo].__mro__:
+        if "__init__" in vars(each):
+            parameters = inspect.signature(vars(each)["__init__"]).parameters.values()
+            arguments |= {parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD}
+            if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+                break
+    arguments -= COMMAND_LINE_ARGUMENTS
     for key in keys:
         if key in arguments or key in ZOO_KEYS:
             continue
@@ -102,13 +113,13 @@ def check_hyperparameters(algo: str, keys: Sequence[str]) -> None:
 
 class ModeExperimentManager(ExperimentManager):
     """
-    The zoo's manager, which refuses unknown hyperparameters, steps this package's tasks all at once, and evaluates
-    DDiffPG with sampled actions: a deterministic evaluation would show one mode only.
+    The zoo's manager, which refuses unknown hyperparameters, steps this package's tasks all at once, and evaluates this
+    package's algorithms with sampled actions: a deterministic evaluation would show one mode only.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        if self.algo == ALGO:
+        if self.algo == ALGO or self.algo in BASELINES:
             self.deterministic_eval = False
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
@@ -130,7 +141,7 @@ class ModeExperimentManager(ExperimentManager):
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         model = super()._load_pretrained_agent(hyperparams, env)
         # The zoo counts steps from zero again; with a full buffer the random warm-up would only do harm
-        if self.algo == ALGO and model.replay_buffer.size() > 0:  # type: ignore[attr-defined]
+        if (self.algo == ALGO or self.algo in BASELINES) and model.replay_buffer.size() > 0:  # type: ignore[attr-defined]
             model.learning_starts = 0  # type: ignore[attr-defined]
         return model
 
@@ -156,10 +167,10 @@ class ModeExperimentManager(ExperimentManager):
         return self._maybe_normalize(env, eval_env)
 
 
-def convert_ddiffpg_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     :param sampled_params: What Optuna sampled
-    :return: Constructor arguments of DDiffPG
+    :return: Constructor arguments
     """
     hyperparams = dict(sampled_params)
     hyperparams["gamma"] = 1 - hyperparams.pop("one_minus_gamma")
@@ -167,15 +178,18 @@ def convert_ddiffpg_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     return hyperparams
 
 
-def sample_ddiffpg_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+def sample_params(
+    algo: str, trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
     """
     Hyperparameters of one trial. The networks stay those of the YAML file.
 
+    :param algo: Name of the algorithm in the zoo
     :param trial: Optuna's trial
     :param n_actions: Not used
     :param n_envs: Not used
     :param additional_args: Not used
-    :return: Constructor arguments of DDiffPG
+    :return: Constructor arguments of the algorithm
     """
     sampled = {
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
@@ -184,14 +198,24 @@ def sample_ddiffpg_params(trial: optuna.Trial, n_actions: int, n_envs: int, addi
         "batch_size_pow": trial.suggest_int("batch_size_pow", 7, 12),
         "tau": trial.suggest_float("tau", 0.005, 0.1, log=True),
         "gradient_steps": trial.suggest_int("gradient_steps", 1, 8, log=True),
-        "action_lr": trial.suggest_float("action_lr", 0.01, 0.5, log=True),
-        "n_action_gradient_steps": trial.suggest_int("n_action_gradient_steps", 1, 20, log=True),
-        "mode_n_steps": trial.suggest_int("mode_n_steps", 1, 5),
-        "mode_mask_prob": trial.suggest_float("mode_mask_prob", 0.1, 0.8),
-        "recluster_freq": trial.suggest_categorical("recluster_freq", [25, 50, 100, 200]),
         "intrinsic_coef": trial.suggest_float("intrinsic_coef", 1e-3, 1.0, log=True),
     }
-    hyperparams = convert_ddiffpg_params(sampled)
+    if algo in (ALGO, "dipo"):
+        sampled["action_lr"] = trial.suggest_float("action_lr", 0.01, 0.5, log=True)
+        sampled["n_action_gradient_steps"] = trial.suggest_int("n_action_gradient_steps", 1, 20, log=True)
+    if algo == ALGO:
+        sampled["mode_n_steps"] = trial.suggest_int("mode_n_steps", 1, 5)
+        sampled["mode_mask_prob"] = trial.suggest_float("mode_mask_prob", 0.1, 0.8)
+        sampled["recluster_freq"] = trial.suggest_categorical("recluster_freq", [25, 50, 100, 200])
+    else:
+        sampled["n_steps"] = trial.suggest_int("n_steps", 1, 5)
+    if algo in ("diffusion_ql", "consistency_ac", "dipo"):
+        sampled["n_diffusion_steps"] = trial.suggest_int("n_diffusion_steps", 2, 10)
+    if algo == "sac_c51":
+        sampled["entropy_learning_rate"] = trial.suggest_float("entropy_learning_rate", 1e-4, 1e-2, log=True)
+    if algo == "td3_c51":
+        sampled["policy_delay"] = trial.suggest_int("policy_delay", 1, 2)
+    hyperparams = convert_params(sampled)
     # What was sampled are the exponents; show the values too
     for name in ("gamma", "batch_size"):
         trial.set_user_attr(name, hyperparams[name])

@@ -20,6 +20,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import nn, optim
 
 from sb3_ddiffpg import DDiffPG, zoo
+from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.envs import PointMazeVecEnv
 from sb3_ddiffpg.zoo import ModeExperimentManager, check_hyperparameters, main
 
@@ -171,16 +172,30 @@ def test_optimise(tmp_path, capsys):
     assert list(tmp_path.glob("ddiffpg/report_*.csv"))
 
 
-def test_sampled_hyperparameters_are_accepted():
+@pytest.mark.parametrize("algo", ["ddiffpg", *BASELINES])
+def test_sampled_hyperparameters_are_accepted(algo):
+    zoo.register()
     env = gym.make(ENV)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(5):
         trial = study.ask()
-        sampled = zoo.sample_ddiffpg_params(trial, 2, 1, {})
+        sampled = zoo.sample_params(algo, trial, 2, 1, {})
         # --trial-id rebuilds them from what the study has stored
-        assert zoo.convert_ddiffpg_params(trial.params) == sampled
+        assert zoo.convert_params(trial.params) == sampled
         assert trial.user_attrs == {"gamma": sampled["gamma"], "batch_size": sampled["batch_size"]}
-        DDiffPG("DiffusionPolicy", env, **sampled)
+        ALGOS[algo]("MlpPolicy", env, **sampled)
+
+
+@pytest.mark.parametrize("algo", BASELINES)
+def test_baselines_in_the_zoo(tmp_path, algo, capsys):
+    settings = {"learning_starts": 40, "batch_size": 16, "buffer_size": 2000, "n_envs": 4, "policy_kwargs": {"net_arch": [16]}}
+    options = ["--algo", algo, "--env", ENV, "-f", str(tmp_path)]
+    hyper = ["--hyperparams", *(f"{key}:{value!r}" for key, value in settings.items())]
+    main(["train", *options, "-n", "200", "--eval-freq", "100", "--eval-episodes", "2", *hyper])
+    config = yaml.unsafe_load((tmp_path / algo / f"{ENV}_1" / ENV / "config.yml").read_text())
+    assert (config["n_steps"], config["reward_scale"]) == (3, 5)
+    main(["enjoy", *options, "--no-render", "-n", "160"])
+    assert "observed mode" in capsys.readouterr().out
 
 
 def test_tracking_needs_nothing_of_ours(tmp_path, monkeypatch):
@@ -224,18 +239,18 @@ def test_qf_learning_rate_as_text():
         parse({"qf_learning_rate": "fast"})
 
 
-@pytest.mark.parametrize("name", ["ddiffpg", "ddiffpg-cpu"])
+@pytest.mark.parametrize("name", ["ddiffpg", "ddiffpg-cpu", *BASELINES])
 def test_our_configuration(name):
     zoo.register()
     entries = yaml.safe_load(zoo.config_file(name).read_text())
     gym.register_envs(gymnasium_robotics)
     for env_id, entry in entries.items():
-        check_hyperparameters("ddiffpg", list(entry))
+        check_hyperparameters("ddiffpg" if name == "ddiffpg-cpu" else name, list(entry))
         assert {"policy", "n_timesteps"} <= set(entry), env_id
         assert env_id in ("paper", "default") or env_id in gym.registry
     ours = {env_id for env_id in gym.registry if str(gym.spec(env_id).entry_point).startswith("sb3_ddiffpg.")}
     assert len(ours) == 14
-    assert {env_id for env_id in ours if name == "ddiffpg" or not env_id.startswith("Point")} <= set(entries)
+    assert {env_id for env_id in ours if name != "ddiffpg-cpu" or not env_id.startswith("Point")} <= set(entries)
     assert zoo.config_file("td3") is None
 
 
@@ -245,7 +260,7 @@ def test_a_configuration_of_ours_by_name(tmp_path):
     config = yaml.unsafe_load((tmp_path / "ddiffpg" / "AntMazeV1-v0_1" / "AntMazeV1-v0" / "config.yml").read_text())
     assert config["env_kwargs"] == {"integrator": "euler"} and config["n_envs"] == 4
     for name in ("no.yml", "ddiffpg-gpu"):
-        with pytest.raises(SystemExit, match=rf"--conf-file: '{name}' given; accepted are .* \['ddiffpg', 'ddiffpg-cpu'\]"):
+        with pytest.raises(SystemExit, match=rf"--conf-file: '{name}' given; accepted are .*'ddiffpg', 'ddiffpg-cpu', "):
             main(["train", "--env", ENV, "--conf-file", name, "-f", str(tmp_path)])
     with pytest.raises(ValueError, match="Hyperparameters not found for ddiffpg-PointMazeV1-v0"):
         main(["train", "--env", ENV, "--conf-file", "ddiffpg-cpu", "-f", str(tmp_path)])

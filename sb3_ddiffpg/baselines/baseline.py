@@ -1,0 +1,92 @@
+"""What the baselines share: one group of critics, a first-in-first-out buffer, and a target actor for those that have one."""
+
+import copy
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+
+from sb3_ddiffpg.actor_critic import NoveltyActorCritic
+from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
+from sb3_ddiffpg.trajectories import Trajectory
+from sb3_ddiffpg.twin_critic_policy import TwinCriticPolicy
+
+
+class FifoReplayBuffer(ModeReplayBuffer):
+    """A ``ModeReplayBuffer`` without modes: the trajectory that ended first is the first to go."""
+
+    def _insert(self, trajectory: Trajectory) -> None:
+        self._retired.append(trajectory)
+
+
+class BaselinePolicy(TwinCriticPolicy):
+    """
+    A ``TwinCriticPolicy`` with a target actor. A subclass says of which class the actors are.
+
+    :param args: Observation space, action space and learning rate
+    :param kwargs: Of ``TwinCriticPolicy``
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        optimizer, self.actor.optimizer = self.actor.optimizer, None
+        self.actor_target = copy.deepcopy(self.actor)
+        self.actor.optimizer = optimizer
+        self.actor_target.set_training_mode(False)
+        self.actor_target.requires_grad_(False)
+
+
+def names_of(policy_class: type[BaselinePolicy]) -> dict[str, type[BasePolicy]]:
+    """
+    :param policy_class: A baseline's policy, which takes any observations
+    :return: SB3's names for it
+    """
+    return dict.fromkeys(("MlpPolicy", "MultiInputPolicy"), policy_class)
+
+
+class Baseline(NoveltyActorCritic):
+    """
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param actor_tau: Soft update coefficient of a target actor, which acts in the Bellman target; None: the actor itself does
+    :param kwargs: Of ``NoveltyActorCritic``
+    """
+
+    default_replay_buffer_class = FifoReplayBuffer
+    policy: BaselinePolicy
+
+    def __init__(self, policy: str | type[BasePolicy], env: Any, *, actor_tau: float | None = None, **kwargs: Any) -> None:
+        self.actor_tau = actor_tau
+        super().__init__(policy, env, **kwargs)
+
+    def _next_actions(self, batch: ModeBatch) -> tuple[th.Tensor, th.Tensor | float]:
+        actor = self.actor if self.actor_tau is None else self.policy.actor_target
+        return actor(batch.next_observations), 0.0
+
+    def _update_targets(self) -> None:
+        super()._update_targets()
+        if self.actor_tau is not None:
+            self._average_actor(self.actor_tau)
+
+    def _average_actor(self, tau: float) -> None:
+        """Let the target actor follow the actor."""
+        actor, target = self.actor, self.policy.actor_target
+        get_ema_multi_avg_fn(1 - tau)(list(target.parameters()), list(actor.parameters()), None)
+        for current, average in zip(actor.buffers(), target.buffers(), strict=True):
+            average.copy_(current)
+
+    def _step_actor(self, loss: th.Tensor) -> th.Tensor:
+        """One step of the actor's optimiser; gives the loss back."""
+        self.actor.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        th.nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
+        self.actor.optimizer.step()
+        return loss.detach()
+
+    def _values(self, batch: ModeBatch, actions: th.Tensor, frozen: bool = True) -> th.Tensor:
+        """Values of actions [n, action_dim] by each critic, [C, n]; the critics' weights are constants."""
+        with th.no_grad():
+            features = self.policy.critic_features(batch.observations)
+        critics = self.policy.critics
+        return critics.values(critics(features, actions[None], frozen=frozen))[0]

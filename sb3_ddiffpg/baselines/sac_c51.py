@@ -1,0 +1,171 @@
+"""SAC with distributional critics."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, names_of
+from sb3_ddiffpg.buffers import ModeBatch
+
+LOG_STD_RANGE = (-5.0, 5.0)
+
+
+class GaussianActor(BasePolicy):
+    """
+    Squashed Gaussian actor.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param net_arch: Hidden layers
+    :param features_extractor: Extracts the features of the observation
+    :param features_dim: Number of features
+    :param activation_fn: Activation of the hidden layers
+    :param normalize_images: Whether images are divided by 255
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: nn.Module,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.ELU,
+        normalize_images: bool = True,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        self.features_dim = features_dim
+        action_dim = get_action_dim(action_space)
+        self.latent = nn.Sequential(*create_mlp(features_dim, 2 * action_dim, net_arch, activation_fn))
+        self.distribution = SquashedDiagGaussianDistribution(action_dim)
+
+    def sample(self, obs: PyTorchObs, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param obs: Observations, [N, ...]
+        :param deterministic: The squashed mean
+        :return: Actions in [-1, 1], [N, action_dim], and their log probabilities, [N]
+        """
+        mean, log_std = self.latent(self.extract_features(obs, self.features_extractor)).chunk(2, dim=1)
+        distribution = self.distribution.proba_distribution(mean, log_std.clamp(*LOG_STD_RANGE))
+        actions = distribution.get_actions(deterministic)
+        return actions, distribution.log_prob(actions, distribution.gaussian_actions)
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """
+        :param obs: Observations, [N, ...]
+        :param deterministic: The squashed mean
+        :return: Actions in [-1, 1], [N, action_dim]
+        """
+        return self.sample(obs, deterministic)[0]
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self(observation, deterministic)
+
+
+class GaussianActorPolicy(BaselinePolicy):
+    """
+    Twin critics and a squashed Gaussian actor.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate of the actor
+    :param activation_fn: Activation of the actor
+    :param kwargs: Of ``TwinCriticPolicy``
+    """
+
+    def __init__(
+        self,
+        observation_space: Any,
+        action_space: Any,
+        lr_schedule: Any,
+        activation_fn: type[nn.Module] = nn.ELU,
+        **kwargs: Any,
+    ) -> None:
+        actor_kwargs = dict(activation_fn=activation_fn)
+        super().__init__(observation_space, action_space, lr_schedule, GaussianActor, actor_kwargs, **kwargs)
+        self._constructor.update(actor_kwargs)
+        # Of the entropy; tuned by the algorithm
+        self.log_entropy_coef = nn.Parameter(th.zeros(()))
+
+
+class SACC51(Baseline):
+    """
+    SAC (Haarnoja et al., 2018, https://arxiv.org/abs/1812.05905) with C51 critics and NovelD; the entropy is part of the
+    projected target. Its own noise explores: there is no other unless ``action_noise`` is given.
+
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param entropy_learning_rate: Learning rate of the entropy's factor
+    :param initial_entropy_coef: Its first value
+    :param target_entropy: Entropy that it aims at; None: minus the action's size
+    :param target_policy_noise: As in ``NoveltyActorCritic``
+    :param kwargs: Of ``Baseline`` and ``NoveltyActorCritic``
+    """
+
+    policy: GaussianActorPolicy
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(GaussianActorPolicy)
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: Any,
+        *,
+        entropy_learning_rate: float = 5e-3,
+        initial_entropy_coef: float = 1.0,
+        target_entropy: float | None = None,
+        target_policy_noise: float = 0.0,
+        **kwargs: Any,
+    ) -> None:
+        self.entropy_learning_rate = entropy_learning_rate
+        self.initial_entropy_coef = initial_entropy_coef
+        self.target_entropy = target_entropy
+        super().__init__(policy, env, target_policy_noise=target_policy_noise, **kwargs)
+
+    def _setup_model(self) -> None:
+        no_noise = self.action_noise is None
+        super()._setup_model()
+        if no_noise:
+            self.action_noise = None
+        with th.no_grad():
+            self.policy.log_entropy_coef.fill_(float(np.log(self.initial_entropy_coef)))
+        self.entropy_optimizer = th.optim.Adam([self.policy.log_entropy_coef], lr=self.entropy_learning_rate)
+
+    @property
+    def entropy_coef(self) -> th.Tensor:
+        """The factor alpha of the entropy, a scalar."""
+        return self.policy.log_entropy_coef.detach().exp()
+
+    def _next_actions(self, batch: ModeBatch) -> tuple[th.Tensor, th.Tensor | float]:
+        actor = self.actor if self.actor_tau is None else self.policy.actor_target
+        actions, log_probabilities = actor.sample(batch.next_observations)
+        return actions, -self.entropy_coef * log_probabilities[None]
+
+    def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
+        actions, log_probabilities = self.actor.sample(batch.observations)
+        target = -float(actions.shape[1]) if self.target_entropy is None else self.target_entropy
+        log_coef = self.policy.log_entropy_coef
+        entropy_loss = -(log_coef * (log_probabilities.detach() + target)).mean()
+        metrics["entropy_coef"].append(self.entropy_coef)
+        values = self._values(batch, actions).min(dim=0).values
+        metrics["actor_loss"].append(self._step_actor((self.entropy_coef * log_probabilities - values).mean()))
+        self.entropy_optimizer.zero_grad()
+        entropy_loss.backward()
+        self.entropy_optimizer.step()
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names, variables = super()._get_torch_save_params()
+        return [*names, "entropy_optimizer"], variables

@@ -1,0 +1,111 @@
+"""TD3 with distributional critics."""
+
+from typing import Any, ClassVar
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, names_of
+from sb3_ddiffpg.buffers import ModeBatch
+
+
+class TanhActor(BasePolicy):
+    """
+    Deterministic actor.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param net_arch: Hidden layers
+    :param features_extractor: Extracts the features of the observation
+    :param features_dim: Number of features
+    :param activation_fn: Activation of the hidden layers
+    :param normalize_images: Whether images are divided by 255
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        net_arch: list[int],
+        features_extractor: nn.Module,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.ELU,
+        normalize_images: bool = True,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        self.features_dim = features_dim
+        self.mu = nn.Sequential(
+            *create_mlp(features_dim, get_action_dim(action_space), net_arch, activation_fn, squash_output=True)
+        )
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = True) -> th.Tensor:
+        """
+        :param obs: Observations, [N, ...]
+        :param deterministic: Not used
+        :return: Actions in [-1, 1], [N, action_dim]
+        """
+        return self.mu(self.extract_features(obs, self.features_extractor))
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self(observation)
+
+
+class TanhActorPolicy(BaselinePolicy):
+    """
+    Twin critics and a deterministic actor.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate of the actor
+    :param activation_fn: Activation of the actor
+    :param kwargs: Of ``TwinCriticPolicy``
+    """
+
+    def __init__(
+        self,
+        observation_space: Any,
+        action_space: Any,
+        lr_schedule: Any,
+        activation_fn: type[nn.Module] = nn.ELU,
+        **kwargs: Any,
+    ) -> None:
+        actor_kwargs = dict(activation_fn=activation_fn)
+        super().__init__(observation_space, action_space, lr_schedule, TanhActor, actor_kwargs, **kwargs)
+        self._constructor.update(actor_kwargs)
+
+
+class TD3C51(Baseline):
+    """
+    TD3 (Fujimoto et al., 2018, https://arxiv.org/abs/1802.09477) with C51 critics and NovelD. As in the DDiffPG paper's
+    comparison the actor climbs the smaller of both critics at every update; ``n_atoms=1, policy_delay=2, actor_tau=0.005,
+    intrinsic_coef=0`` are TD3's own.
+
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param policy_delay: Updates of the critics for each of the actor
+    :param kwargs: Of ``Baseline`` and ``NoveltyActorCritic``
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(TanhActorPolicy)
+
+    def __init__(self, policy: str | type[BasePolicy], env: Any, *, policy_delay: int = 1, **kwargs: Any) -> None:
+        self.policy_delay = policy_delay
+        self._n_critic_updates = 0
+        super().__init__(policy, env, **kwargs)
+
+    def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
+        self._n_critic_updates += 1
+        if self._n_critic_updates % self.policy_delay == 0:
+            values = self._values(batch, self.actor(batch.observations))
+            metrics["actor_loss"].append(self._step_actor(-values.min(dim=0).values.mean()))

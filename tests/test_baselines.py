@@ -1,0 +1,332 @@
+"""The baselines: each against something independent, and all as SB3 algorithms."""
+
+import math
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import torch as th
+from environments import AnySpaces, TwoEnds, image_dict_space
+from gymnasium import spaces
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.baselines import BASELINES, DIPO, SACC51, TD3C51, ConsistencyAC, DiffusionQL
+from sb3_ddiffpg.baselines.consistency_ac import SIGMA_MAX, SIGMA_MIN, karras_sigmas
+from sb3_ddiffpg.diffusion import variance_preserving_betas
+from sb3_ddiffpg.evaluation import evaluate_modes
+
+SMALL = {"learning_starts": 40, "buffer_size": 2000, "batch_size": 32, "train_freq": 4, "seed": 0}
+
+
+def small(algorithm, env=None, policy="MlpPolicy", **changes):
+    env = DummyVecEnv([TwoEnds] * 4) if env is None else env
+    model = algorithm(policy, env, **{"policy_kwargs": {"net_arch": [16]}, **SMALL, **changes})
+    model.set_logger(Logger(None, []))
+    return model
+
+
+@pytest.fixture(params=BASELINES.values(), ids=BASELINES.keys())
+def algorithm(request):
+    return request.param
+
+
+# ------------------------------------------------------------------ as SB3 algorithms
+
+
+def test_saves_loads_and_goes_on(algorithm, tmp_path):
+    model = small(algorithm, actor_tau=0.1)
+    model.learn(200)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    model.policy.save(tmp_path / "policy")
+    loaded = algorithm.load(tmp_path / "model", env=DummyVecEnv([TwoEnds] * 4))
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    obs = np.random.default_rng(0).uniform(-1, 1, (5, 2)).astype(np.float32)
+    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], loaded.predict(obs, deterministic=True)[0])
+    policy = type(model.policy).load(tmp_path / "policy")
+    np.testing.assert_array_equal(policy.predict(obs, deterministic=True)[0], loaded.predict(obs, deterministic=True)[0])
+    for name, before in model.get_parameters().items():
+        after = loaded.get_parameters()[name]
+        if "optimizer" not in name:
+            assert all(th.equal(before[key], after[key]) for key in before), name
+    assert loaded.replay_buffer.size() == model.replay_buffer.size()
+    loaded.learn(60, reset_num_timesteps=False)
+    assert loaded.num_timesteps >= model.num_timesteps + 60 and loaded._n_updates > model._n_updates
+
+
+@pytest.mark.parametrize("space", [spaces.Discrete(3), image_dict_space(), spaces.Box(0, 255, (1, 36, 36), dtype=np.uint8)])
+def test_observations(algorithm, space):
+    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
+    model = small(algorithm, DummyVecEnv([lambda: AnySpaces(space)]), policy, learning_starts=10, v_max=20.0)
+    model.learn(24)
+
+
+def test_with_normalised_observations(algorithm):
+    model = small(algorithm, VecNormalize(DummyVecEnv([TwoEnds] * 4), norm_reward=False))
+    model.learn(120)
+    assert model.is_normalized
+
+
+def test_the_same_seed_is_the_same_run(algorithm):
+    models = [small(algorithm, seed=7).learn(120) for _ in range(2)]
+    for first, second in zip(*(model.policy.parameters() for model in models), strict=True):
+        assert th.equal(first, second)
+
+
+def test_bad_arguments_are_named(algorithm):
+    for argument, value in (("n_steps", 0), ("gamma", 1.5), ("novelty", "none"), ("v_max", -1.0)):
+        with pytest.raises(ValueError, match=argument):
+            small(algorithm, **{argument: value})
+
+
+def test_the_first_trajectory_is_the_first_to_go(algorithm):
+    model = small(algorithm, buffer_size=60, learning_starts=10**6)
+    model.learn(400)
+    rows = model.replay_buffer._all.rows[: model.replay_buffer.size()]
+    serials = [trajectory.serial for trajectory in model.replay_buffer._retired]
+    assert serials == sorted(serials) and serials[-1] - serials[0] == len(serials) - 1
+    finished = sum(trajectory.length for trajectory in model.replay_buffer._retired)
+    assert finished <= len(rows) <= 60
+
+
+def test_modes_are_counted_without_commands(algorithm):
+    model = small(algorithm)
+    model.learn(60)
+    found = evaluate_modes(model, DummyVecEnv([TwoEnds] * 2), 2)
+    assert found.commanded == () and found.uncommanded.n_episodes == 4
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_rewards_are_the_environments_and_what_is_new(algorithm, n_steps):
+    """Both discounted over the steps of a return."""
+    model = small(algorithm, n_steps=n_steps, reward_scale=3.0, normalize_intrinsic=False, gamma=0.9)
+    model.learn(100)
+    seen = {}
+    model._update_critics = lambda batch, rewards: seen.update(batch=batch, rewards=rewards) or th.zeros(())
+    model.train(1, 32)
+    batch, buffer = seen["batch"], model.replay_buffer
+    for k, window in enumerate(batch.windows[0]):
+        expected = 0.0
+        for step, row in enumerate(window[window >= 0]):
+            now, then = (
+                model.novelty_model.novelty(*model._novelty_inputs(th.from_numpy(obs[row : row + 1]))).item()
+                for obs in (buffer.observations, buffer.next_observations)
+            )
+            new = model.intrinsic_coef * max(then - model.novelty_scale * now, 0.0)
+            expected += 0.9**step * (3.0 * buffer.rewards[row] + new)
+        assert seen["rewards"][0, k].item() == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    assert batch.windows.shape[-1] == n_steps
+
+
+# ------------------------------------------------------------------ DIPO
+
+
+def test_dipo_updates_as_ddiffpg_without_modes_does():
+    """The same networks (DDiffPG's embedding of zero added) and batch: the same target actions, losses and steps."""
+    settings = {"policy_kwargs": {"net_arch": [16, 16]}, "n_action_gradient_steps": 3, "action_lr": 0.1}
+    dipo, ours = (
+        small(DIPO, learning_starts=10**6, **settings),
+        small(DDiffPG, mode_embedding_dim=1, exploration_v_max=5.0, **settings),
+    )
+    dipo.learn(40)
+    state = dipo.policy.state_dict()
+    name = "actor.diffusion.denoiser.condition_in.weight"
+    state[name] = th.cat((state[name], th.zeros(16, 1)), dim=1)
+    state["mode_embeddings"] = th.zeros(1, 1)
+    ours.policy.load_state_dict({key: value for key, value in state.items() if not key.startswith("actor_target")})
+    np.random.seed(0)
+    batch = dipo.replay_buffer.sample_modes(32, dipo.gamma, 1, 1)
+    ours.replay_buffer.store_target_actions = dipo.replay_buffer.store_target_actions = lambda *_: None
+    rewards = th.rand(1, 32)
+    th.manual_seed(1)
+    critic_losses = dipo._update_critics(batch, rewards)
+    metrics = defaultdict(list)
+    dipo._update_actor(batch, metrics)
+    th.manual_seed(1)
+    assert th.equal(critic_losses, ours._update_critics(batch, rewards))
+    improved = ours._improve_target_actions(batch)
+    ours.mode_mask_prob = 0.0
+    drawn = th.rand
+    th.rand = lambda *shape, **kwargs: th.ones(*shape, **kwargs)  # DDiffPG's mask draws where DIPO has none
+    try:
+        actor_loss = ours._update_policy(batch, improved)
+    finally:
+        th.rand = drawn
+    th.testing.assert_close(metrics["actor_loss"][0], actor_loss)
+    th.testing.assert_close(metrics["target_action_shift"][0], (improved - batch.target_actions).abs().mean())
+    for key, value in dipo.policy.critics.state_dict().items():
+        th.testing.assert_close(value, ours.policy.critics.state_dict()[key])
+    th.testing.assert_close(dipo.actor.diffusion.denoiser.trunk.state_dict(), ours.actor.diffusion.denoiser.trunk.state_dict())
+
+
+def test_dipo_limits_the_whole_batchs_gradient():
+    model = small(DIPO, total_gradient_ratio=1e-3, action_optimizer="sgd", action_lr=1.0)
+    model.learn(60)
+    batch = model.replay_buffer.sample_modes(32, model.gamma, 1, 1)
+    stored = {}
+    model.replay_buffer.store_target_actions = lambda _, improved: stored.update(improved=improved)
+    model._update_actor(batch, defaultdict(list))
+    moved = (stored["improved"] - batch.target_actions).norm()
+    assert 0 < moved <= 1.01e-3
+
+
+# ------------------------------------------------------------------ Diffusion-QL
+
+
+def test_variance_preserving_schedule():
+    """The numbers that Diffusion-QL's code has for five steps."""
+    np.testing.assert_allclose(variance_preserving_betas(5), [0.196, 0.459, 0.636, 0.755, 0.835], atol=5e-4)
+
+
+def test_the_critics_gradient_reaches_the_actor_through_all_steps():
+    model = small(DiffusionQL, policy_kwargs={"net_arch": [8]}, n_diffusion_steps=4)
+    diffusion = model.actor.diffusion.double()
+    condition, noise = th.randn(6, 2).double(), th.randn(4, 6, 1).double()
+    best = th.rand(6, 1).double() - 0.5
+
+    def loss():
+        return (diffusion.denoise(condition, noise=noise) - best).pow(2).mean()
+
+    loss().backward()
+    gradients = {name: parameter.grad.clone() for name, parameter in diffusion.named_parameters()}
+    for name, parameter in diffusion.named_parameters():
+        place = tuple(np.random.default_rng(0).integers(size) for size in parameter.shape)
+        with th.no_grad():
+            parameter[place] += 1e-6
+            above = loss()
+            parameter[place] -= 2e-6
+            numeric = (above - loss()) / 2e-6
+            parameter[place] += 1e-6
+        assert gradients[name][place].item() == pytest.approx(numeric.item(), rel=1e-3, abs=1e-8), name
+
+
+def test_candidates_are_drawn_by_value(monkeypatch):
+    model = small(DiffusionQL, n_candidates=3)
+    candidates = th.tensor([[-0.5], [0.0], [0.5]])
+    values = th.tensor([0.0, math.log(2.0), math.log(5.0)])  # odds 1 : 2 : 5
+    monkeypatch.setattr(model.actor, "forward", lambda obs: candidates.repeat(len(obs) // 3, 1))
+    critics = model.policy.critics_target
+    monkeypatch.setattr(critics, "values", lambda _: values.repeat(4000)[None, None].expand(1, 2, -1))
+    actions = model.predict(np.zeros((4000, 2), dtype=np.float32))[0][:, 0]
+    shares = [np.isclose(actions, value).mean() for value in (-0.5, 0.0, 0.5)]
+    np.testing.assert_allclose(shares, [1 / 8, 2 / 8, 5 / 8], atol=0.03)
+
+
+# ------------------------------------------------------------------ Consistency-AC
+
+
+def test_an_action_of_the_smallest_noise_level_stays_as_it_is():
+    actor = small(ConsistencyAC).actor
+    actions = th.randn(7, 1)
+    part = actor.network.condition_in(th.randn(7, 2))
+    th.testing.assert_close(actor.consistency(actions, part, th.full((7,), SIGMA_MIN)), actions)
+    # and of the largest, nearly nothing of it is left
+    assert (actor.consistency(SIGMA_MAX * actions, part, th.full((7,), SIGMA_MAX)) - actions).abs().min() > 1e-4
+
+
+def test_noise_levels_as_in_karras():
+    """Equation 5 of Karras et al. (2022), by hand."""
+    sigmas = karras_sigmas(th.arange(18), 18)
+    expected = [(0.002 ** (1 / 7) + i / 17 * (80 ** (1 / 7) - 0.002 ** (1 / 7))) ** 7 for i in range(18)]
+    np.testing.assert_allclose(sigmas, expected, rtol=1e-4)
+
+
+def test_the_consistency_loss_makes_the_actor_a_model_of_the_buffer():
+    model = small(ConsistencyAC, consistency_coef=1.0, actor_tau=0.05, n_levels=(4, 12), policy_kwargs={"net_arch": [64]})
+    model.learn(60)
+    batch = model.replay_buffer.sample_modes(32, model.gamma, 1, 1)
+    batch = batch._replace(actions=th.full_like(batch.actions, 0.4))
+    for _ in range(400):
+        model._step_actor(model._consistency_loss(batch))
+        model._average_actor(0.05)
+    assert (model.actor(batch.observations) - 0.4).abs().mean() < 0.15
+
+
+# ------------------------------------------------------------------ TD3 and SAC
+
+
+def test_td3_updates_as_sb3s_does():
+    """Scalar critics, the same networks and batch: the same losses."""
+    arch = {"net_arch": [16], "activation_fn": th.nn.ReLU}
+    kwargs = {**arch, "critic_activation_fn": th.nn.ReLU}
+    ours = small(TD3C51, n_atoms=1, v_min=-10.0, v_max=10.0, policy_kwargs=kwargs)
+    theirs = TD3("MlpPolicy", DummyVecEnv([TwoEnds] * 4), policy_kwargs=arch, target_policy_noise=0.0)
+    with th.no_grad():
+        for layer, (weight, bias) in enumerate(zip(ours.critics.weights, ours.critics.biases, strict=True)):
+            for twin, q in enumerate([theirs.critic.qf0, theirs.critic.qf1]):
+                q[2 * layer].weight.copy_(weight[0, twin].T)
+                q[2 * layer].bias.copy_(bias[0, twin, 0])
+        theirs.actor.mu.load_state_dict(ours.actor.mu.state_dict())
+    obs = th.rand(9, 2) * 4 - 2
+    scaled = ours.actor.extract_features(obs, ours.actor.features_extractor)  # ours scales bounded observations
+    actions = theirs.actor.mu(scaled)
+    th.testing.assert_close(ours.actor(obs), actions)
+    q_values = th.stack([q(th.cat((scaled, actions), dim=1)) for q in (theirs.critic.qf0, theirs.critic.qf1)])[..., 0]
+    features = ours.policy.critic_features(obs)
+    th.testing.assert_close(ours.critics.values(ours.critics(features, actions[None]))[0], q_values)
+    target = 0.3 + 0.9 * q_values.min(dim=0).values
+    found = ours.critics.bellman_target(features, actions[None], th.full((1, 9), 0.3), th.full((1, 9), 0.9))
+    th.testing.assert_close(found[0, :, 0], target)
+    expected = sum(th.nn.functional.mse_loss(q, target) for q in q_values)
+    th.testing.assert_close(ours.critics.loss(features, actions[None], found)[0], expected)
+
+
+def test_td3_waits_with_its_policy():
+    model = small(TD3C51, policy_delay=3)
+    model.learn(40)
+    metrics = defaultdict(list)
+    batch = model.replay_buffer.sample_modes(32, model.gamma, 1, 1)
+    model._n_critic_updates = 0
+    for _ in range(7):
+        model._update_actor(batch, metrics)
+    assert len(metrics["actor_loss"]) == 2
+
+
+def test_sacs_entropy_is_part_of_the_target():
+    model = small(SACC51, n_atoms=1, v_min=-100.0, v_max=100.0, initial_entropy_coef=0.7)
+    model.learn(40)
+    batch = model.replay_buffer.sample_modes(32, model.gamma, 1, 1)
+    th.manual_seed(0)
+    actions, bonus = model._next_actions(batch)
+    th.manual_seed(0)
+    features = model.actor.extract_features(batch.next_observations, model.actor.features_extractor)
+    mean, log_std = model.actor.latent(features).chunk(2, 1)
+    normal = th.distributions.Normal(mean, log_std.clamp(-5, 5).exp())
+    before = th.atanh(actions.clamp(-1 + 1e-6, 1 - 1e-6))
+    by_hand = (normal.log_prob(before) - th.log(1 - actions**2 + 1e-6)).sum(dim=1)
+    th.testing.assert_close(bonus[0], -model.entropy_coef * by_hand, rtol=1e-2, atol=1e-2)
+
+
+def test_sacs_entropy_coefficient_follows_its_target():
+    lower = small(SACC51, target_entropy=-50.0)
+    higher = small(SACC51, target_entropy=50.0)
+    for model in (lower, higher):
+        model.learn(120)
+    assert lower.entropy_coef < 1.0 < higher.entropy_coef
+    assert lower.action_noise is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("ours", "theirs"), [(TD3C51, TD3), (SACC51, SAC)])
+def test_pendulum_is_learnt_as_by_sb3(ours, theirs):
+    """Scalar critics, no bonus, SB3's own settings: both swing it up within 6000 steps, by three seeds each."""
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    settings = {"learning_starts": 500, "batch_size": 256, "tau": 0.005, "gamma": 0.98, "learning_rate": 1e-3}
+    arch = {"net_arch": [64, 64]}
+    own = {"n_atoms": 1, "v_min": -2000.0, "v_max": 0.0, "intrinsic_coef": 0.0, "max_grad_norm": 1e6}
+    if ours is TD3C51:
+        own |= {"policy_delay": 2, "actor_tau": 0.005, "target_policy_noise": 0.2, "target_noise_clip": 0.5}
+    returns = {}
+    for name, algorithm, extra in (("ours", ours, own), ("sb3", theirs, {})):
+        found = []
+        for seed in range(3):
+            model = algorithm("MlpPolicy", "Pendulum-v1", seed=seed, policy_kwargs=arch, **settings, **extra)
+            model.learn(6000)
+            found.append(evaluate_policy(model, model.get_env(), 10, deterministic=True)[0])
+        returns[name] = np.array(found)
+    assert returns["sb3"].mean() > -400
+    assert returns["ours"].mean() > returns["sb3"].mean() - 2 * returns["sb3"].std() - 60, returns
