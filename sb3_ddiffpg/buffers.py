@@ -45,6 +45,7 @@ class ModeBatch(NamedTuple):
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
     *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct", "loop_share", "route_share"),
+    "new_way_share",
 )
 
 
@@ -73,6 +74,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         about the mean distance along the way; False for the root of the summed squares, to which the paper's thresholds refer
     :param loop_share: Radius within which a path that comes back has made a loop, as a share of the path's extent
     :param route_share: Distance beyond which a step is off a mode's route, as a share of the route's extent
+    :param new_way_share: Share of the exploratory group's rows that are drawn from trajectories which reached a goal by a way of
+        which a mode has not its fill
     :raises ValueError: If a size is not positive or ``optimize_memory_usage`` is asked for
     """
 
@@ -102,6 +105,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         normalize_distances: bool = True,
         loop_share: float = 0.05,
         route_share: float = 0.1,
+        new_way_share: float = 0.0,
     ) -> None:
         for name, value, least in (
             ("max_successes_per_mode", max_successes_per_mode, 1),
@@ -111,6 +115,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             ("n_path_points", n_path_points, 2),
             ("loop_share", loop_share, 0),
             ("route_share", route_share, 0),
+            ("new_way_share", new_way_share, 0),
         ):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
@@ -123,6 +128,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.normalize_distances = normalize_distances
         self.loop_share = loop_share
         self.route_share = route_share
+        self.new_way_share = new_way_share
         super().__init__(
             buffer_size,
             observation_space,
@@ -146,6 +152,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self._mode_position = np.empty(0, dtype=np.int32)
         self._last_positions = np.empty((0, self.features.dim), dtype=np.float32)
         self.mode_rows: list[RowSet] = []
+        self._new_way_rows = np.empty(0, dtype=np.int32)
 
     def _step_fields(self) -> Fields:
         action = ((self.action_dim,), np.float32)
@@ -182,6 +189,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         trajectory = super()._evict()
         if trajectory.trains:
             self.mode_rows[trajectory.mode].remove(trajectory.rows)
+        if self.way_novelty[trajectory.rows[-1]] > 0:
+            self._new_way_rows = np.setdiff1d(self._new_way_rows, trajectory.rows)
         return trajectory
 
     # ------------------------------------------------------------------ modes
@@ -335,6 +344,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             trajectory.mode, trajectory.trains, trajectory.path = NO_MODE, False, None
             self.way_novelty[trajectory.rows[-1]] = 0.0
             self._retired.append(trajectory)
+        new_ways = [trajectory.rows for trajectory in stays if self.way_novelty[trajectory.rows[-1]] > 0]
+        self._new_way_rows = np.concatenate([self._new_way_rows[:0], *new_ways])
 
     def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:
         """
@@ -404,6 +415,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         active = np.array([True, *(row_set.size > 0 for row_set in self.mode_rows)])
         sets = [self._all, *(row_set if row_set.size else self._all for row_set in self.mode_rows)]
         rows = np.stack([row_set.sample(n) for row_set in sets])  # [G, n]
+        if len(self._new_way_rows) and self.new_way_share:
+            n_new = round(self.new_way_share * n)
+            rows[EXPLORATORY_GROUP, :n_new] = np.random.choice(self._new_way_rows, n_new)
         windows, notes = self._windows(rows, exploration_n_steps, mode_n_steps)
         present = windows >= 0
         powers = np.float32(gamma) ** np.arange(windows.shape[-1], dtype=np.float32)

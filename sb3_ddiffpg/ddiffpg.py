@@ -32,6 +32,10 @@ from sb3_ddiffpg.validation import check_mode_arguments
 SelfDDiffPG = TypeVar("SelfDDiffPG", bound="DDiffPG")
 
 
+# Of the exploratory group's batch, from trajectories that took a new way: among all transitions these are too few to be met
+NEW_WAY_SHARE = 0.25
+
+
 class DDiffPG(ModeControl, NoveltyActorCritic):
     """
     Deep Diffusion Policy Gradient (DDiffPG): learns several ways to solve one task.
@@ -107,6 +111,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
     :param max_grad_norm: Largest gradient norm of the policy and of each mode's critics
+    :param control: For comparison only, one of ``CONTROLS``: ``"shuffled_embeddings"`` (each row of a mode is learnt with a
+        mode's embedding, but anyone's), ``"random_clusters"`` (as many clusters of the same sizes, but of any trajectories)
     :param stats_window_size: Window size for the rollout logging
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Additional arguments of the policy, see ``DiffusionPolicy``
@@ -186,6 +192,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         normalize_intrinsic: bool = True,
         reset_new_critics: bool = True,
         max_grad_norm: float = 1.0,
+        control: str | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -261,6 +268,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         self.mode_intrinsic_coef = mode_intrinsic_coef
         self.new_way_coef = new_way_coef
         self.reset_new_critics = reset_new_critics
+        self.control = control
 
         # What a run remembers beside its networks; all of it is saved
         self.n_rollouts = 0
@@ -290,6 +298,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             **super()._buffer_arguments(),
             "max_successes_per_mode": self.max_successes_per_mode,
             "max_failures_per_mode": self.max_failures_per_mode,
+            "new_way_share": NEW_WAY_SHARE if self.new_way_coef else 0.0,
         }
 
     def _check_arguments(self) -> None:
@@ -348,6 +357,9 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         """Embedding of every row's group, [G * n, mode_embedding_dim]; masked with probability p, exploration never."""
         n_groups, n = batch.rows.shape
         embeddings = self.policy.mode_embeddings[:, None].expand(-1, n, -1)
+        if self.control == "shuffled_embeddings":
+            owners = th.randperm((n_groups - 1) * n, device=self.device)
+            embeddings = th.cat((embeddings[:1], embeddings[1:].flatten(0, 1)[owners].view_as(embeddings[1:])))
         if masked:
             keep = (th.rand(n_groups, n, 1, device=self.device) >= self.mode_mask_prob).to(embeddings.dtype)
             keep[EXPLORATORY_GROUP] = 1.0

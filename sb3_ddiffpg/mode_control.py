@@ -43,6 +43,7 @@ class ModeControl:
     reset_new_critics: bool
     distance_threshold: float | None
     linkage: str
+    control: str | None
     _modes: list[Mode]
     _next_mode_number: int
     _behavior: Behavior
@@ -100,7 +101,8 @@ class ModeControl:
     def _cluster(self, distances: np.ndarray) -> np.ndarray:
         if self.max_modes == 1:
             return np.zeros(len(distances), dtype=int)  # clustering off: whatever reaches the goal is the one mode
-        return cluster(distances, self.distance_threshold, self.linkage, self.max_modes, self.min_mode_size)
+        labels = cluster(distances, self.distance_threshold, self.linkage, self.max_modes, self.min_mode_size)
+        return np.random.permutation(labels) if self.control == "random_clusters" else labels
 
     def _replace_modes(self, found: Reclustering) -> list[ModeEvent]:
         """Let buffer, policy, table and environments follow a re-clustering."""

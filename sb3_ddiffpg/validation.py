@@ -12,6 +12,9 @@ from sb3_ddiffpg.critics import TWIN_TARGETS
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES
 from sb3_ddiffpg.target_actions import ACTION_OPTIMIZERS
 
+# Of DDiffPG, for comparison
+CONTROLS = ("shuffled_embeddings", "random_clusters")
+
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and not np.isnan(value)
@@ -75,6 +78,7 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     (("action_optimizer",), f"be one of {list(ACTION_OPTIMIZERS)}", lambda value: value in ACTION_OPTIMIZERS),
     (("twin_target",), f"be one of {list(TWIN_TARGETS)}", lambda value: value in TWIN_TARGETS),
     (("backup_embedding",), "be one of ['mode', 'masked']", lambda value: value in ("mode", "masked")),
+    (("control",), f"be None or one of {list(CONTROLS)}", lambda value: value is None or value in CONTROLS),
     (("linkage",), f"be one of {list(LINKAGES)}", lambda value: value in LINKAGES),
     (
         ("novelty",),

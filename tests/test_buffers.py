@@ -435,6 +435,11 @@ def test_goals_by_new_ways_are_worth_something_to_exploration():
         expected = 2.0 * worth[int(obs[k])] * (1.0 if ends[k] else GAMMA if ahead else 0.0)
         assert value == pytest.approx(expected), (obs[k], ends[k])
     assert (batch.new_ways > 0).any()
+    buffer.new_way_share = 0.5
+    drawn = buffer.observations[buffer.sample_modes(900, GAMMA, 1, 1).rows[0], 0]
+    assert {6, 7, 8} == set(drawn[:150]) and set(drawn[150:]) == set(range(10))
+    buffer._evict()  # the first to go is a retired one, which none of them is
+    assert len(buffer._new_way_rows) == 6
     buffer.add(*[np.full((1, 2), 7, np.float32)] * 2, np.zeros((1, 2)), np.zeros(1), np.zeros(1, bool), [{}])
     assert buffer.way_novelty[buffer._running[0, 0]] == 0.0
 

@@ -136,6 +136,27 @@ def test_embeddings_are_masked_as_a_whole_and_exploration_never(probability):
             assert none.float().mean().item() == pytest.approx(probability * masked, abs=0.05)
 
 
+def test_shuffled_embeddings_say_nothing_of_the_mode():
+    model = trained_model(control="shuffled_embeddings")
+    batch = draw(model, 90)
+    rows = model._row_embeddings(batch, masked=False).view(3, 30, -1)
+    table = model.policy.mode_embeddings
+    assert (rows[0] == table[0]).all()
+    mine = (rows[1:] == table[1:, None]).all(dim=2).float().mean(dim=1)
+    assert ((mine > 0.2) & (mine < 0.8)).all()
+    each = th.stack([(rows[1:].flatten(0, 1) == embedding).all(dim=1).sum() for embedding in table[1:]])
+    assert each.tolist() == [30, 30]
+
+
+def test_random_clusters_have_the_sizes_of_the_true_ones():
+    model = trained_model(control="random_clusters")
+    distances = np.full((40, 40), 5.0, dtype=np.float32)
+    distances[:30, :30] = distances[30:, 30:] = 0.1
+    np.fill_diagonal(distances, 0.0)
+    labels = model._cluster(distances)
+    assert sorted(np.bincount(labels).tolist()) == [10, 30] and len(set(labels[30:])) == 2
+
+
 @pytest.mark.parametrize("backup_embedding", ["mode", "masked"])
 def test_the_backup_follows_the_mode(backup_embedding):
     model = trained_model(backup_embedding=backup_embedding, mode_mask_prob=0.5)
