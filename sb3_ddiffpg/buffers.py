@@ -74,8 +74,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         about the mean distance along the way; False for the root of the summed squares, to which the paper's thresholds refer
     :param loop_share: Radius within which a path that comes back has made a loop, as a share of the path's extent
     :param route_share: Distance beyond which a step is off a mode's route, as a share of the route's extent
-    :param new_way_share: Share of the exploratory group's rows that are drawn from trajectories which reached a goal by a way of
-        which a mode has not its fill
+    :param new_way_share: Share of the exploratory group's rows that are drawn from trajectories which reached a goal by a way
+        of which a mode has not its fill
     :raises ValueError: If a size is not positive or ``optimize_memory_usage`` is asked for
     """
 
