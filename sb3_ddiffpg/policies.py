@@ -6,17 +6,16 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, UNCONDITIONED
 from sb3_ddiffpg.diffusion import Denoiser, DiffusionModel
-from sb3_ddiffpg.twin_critic_policy import TwinCriticPolicy
+from sb3_ddiffpg.twin_critic_policy import Actor, TwinCriticPolicy
 
 
-class DiffusionActor(BasePolicy):
+class DiffusionActor(Actor):
     """
     Diffusion policy conditioned on observation and mode embedding.
 
@@ -47,14 +46,8 @@ class DiffusionActor(BasePolicy):
         normalize_images: bool = True,
         noise_schedule: str = "cosine",
     ) -> None:
-        super().__init__(
-            observation_space,
-            action_space,
-            features_extractor=features_extractor,
-            normalize_images=normalize_images,
-            squash_output=True,
-        )
-        self.net_arch, self.features_dim, self.activation_fn = net_arch, features_dim, activation_fn
+        super().__init__(observation_space, action_space, features_extractor, features_dim, normalize_images)
+        self.net_arch, self.activation_fn = net_arch, activation_fn
         self.n_diffusion_steps = n_diffusion_steps
         self.mode_embedding_dim, self.time_embedding_dim = mode_embedding_dim, time_embedding_dim
         denoiser = Denoiser(
@@ -67,7 +60,6 @@ class DiffusionActor(BasePolicy):
         )
         self.noise_schedule = noise_schedule
         self.diffusion = DiffusionModel(denoiser, n_diffusion_steps, noise_schedule)
-        self.optimizer: th.optim.Optimizer
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -89,7 +81,7 @@ class DiffusionActor(BasePolicy):
         :param embeddings: Mode embeddings, [N, mode_embedding_dim]; zero when None
         :return: What the denoiser is conditioned on, [N, features_dim + mode_embedding_dim]
         """
-        features = self.extract_features(obs, self.features_extractor)
+        features = self.features(obs)
         if embeddings is None:
             embeddings = features.new_zeros(features.shape[0], self.mode_embedding_dim)
         return th.cat((features, embeddings), dim=1)
@@ -102,9 +94,6 @@ class DiffusionActor(BasePolicy):
         :return: Actions in [-1, 1], [N, action_dim]
         """
         return self.diffusion.sample(self.condition(obs, embeddings), deterministic=deterministic)
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self(observation, deterministic)
 
 
 class DiffusionPolicy(TwinCriticPolicy):

@@ -14,6 +14,45 @@ from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.features import ScaledFlattenExtractor
 
 
+class Actor(BasePolicy):
+    """
+    What all actors have in common.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param features_extractor: Extracts the features of the observation
+    :param features_dim: Number of features
+    :param normalize_images: Whether images are divided by 255
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        features_extractor: nn.Module,
+        features_dim: int,
+        normalize_images: bool = True,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor=features_extractor,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        self.features_dim = features_dim
+
+    def features(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        :param obs: Observations, [N, ...]
+        :return: [N, features_dim]
+        """
+        return self.extract_features(obs, self.features_extractor)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self(observation, deterministic)
+
+
 class TwinCriticPolicy(BasePolicy):
     """
     An actor, twin critics and their targets, each with a features extractor of its own.

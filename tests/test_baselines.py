@@ -261,7 +261,7 @@ def test_td3_updates_as_sb3s_does():
                 q[2 * layer].bias.copy_(bias[0, twin, 0])
         theirs.actor.mu.load_state_dict(ours.actor.mu.state_dict())
     obs = th.rand(9, 2) * 4 - 2
-    scaled = ours.actor.extract_features(obs, ours.actor.features_extractor)  # ours scales bounded observations
+    scaled = ours.actor.features(obs)  # ours scales bounded observations
     actions = theirs.actor.mu(scaled)
     th.testing.assert_close(ours.actor(obs), actions)
     q_values = th.stack([q(th.cat((scaled, actions), dim=1)) for q in (theirs.critic.qf0, theirs.critic.qf1)])[..., 0]
@@ -292,7 +292,7 @@ def test_sacs_entropy_is_part_of_the_target():
     th.manual_seed(0)
     actions, bonus = model._next_actions(batch)
     th.manual_seed(0)
-    features = model.actor.extract_features(batch.next_observations, model.actor.features_extractor)
+    features = model.actor.features(batch.next_observations)
     mean, log_std = model.actor.latent(features).chunk(2, 1)
     normal = th.distributions.Normal(mean, log_std.clamp(-5, 5).exp())
     before = th.atanh(actions.clamp(-1 + 1e-6, 1 - 1e-6))

@@ -13,24 +13,24 @@ from torch import nn
 from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, names_of
 from sb3_ddiffpg.buffers import ModeBatch
 from sb3_ddiffpg.diffusion import Denoiser
+from sb3_ddiffpg.twin_critic_policy import Actor
 
 SIGMA_DATA, SIGMA_MIN, SIGMA_MAX = 0.5, 0.002, 80.0
 RHO = 7.0
 
 
-class ConsistencyActor(BasePolicy):
+class ConsistencyActor(Actor):
     """
     Consistency model (Song et al., 2023): one network takes a noisy action of any level to a clean one.
 
     :param observation_space: Observation space
     :param action_space: Action space
     :param net_arch: Hidden layers of the network
-    :param features_extractor: Extracts the features of the observation
     :param features_dim: Number of features
     :param activation_fn: Activation of the network
     :param n_diffusion_steps: Evaluations of the network for one action
     :param time_embedding_dim: Size of a noise level's embedding
-    :param normalize_images: Whether images are divided by 255
+    :param kwargs: Of ``Actor``
     """
 
     sigmas: th.Tensor
@@ -39,22 +39,14 @@ class ConsistencyActor(BasePolicy):
         self,
         observation_space: spaces.Space,
         action_space: spaces.Box,
-        net_arch: list[int],
-        features_extractor: nn.Module,
         features_dim: int,
+        net_arch: list[int],
         activation_fn: type[nn.Module] = nn.SiLU,
         n_diffusion_steps: int = 2,
         time_embedding_dim: int = 32,
-        normalize_images: bool = True,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(
-            observation_space,
-            action_space,
-            features_extractor=features_extractor,
-            normalize_images=normalize_images,
-            squash_output=True,
-        )
-        self.features_dim = features_dim
+        super().__init__(observation_space, action_space, features_dim=features_dim, **kwargs)
         self.network = Denoiser(
             features_dim, get_action_dim(action_space), n_diffusion_steps, net_arch, activation_fn, time_embedding_dim
         )
@@ -84,7 +76,7 @@ class ConsistencyActor(BasePolicy):
         :param deterministic: Zero latent and noise
         :return: Actions in [-1, 1], [N, action_dim]
         """
-        condition_part = self.network.condition_in(self.extract_features(obs, self.features_extractor))
+        condition_part = self.network.condition_in(self.features(obs))
         shape = (len(condition_part), self.network.action_in.in_features)
 
         def noise() -> th.Tensor:
@@ -97,9 +89,6 @@ class ConsistencyActor(BasePolicy):
                 actions = actions + (sigma**2 - SIGMA_MIN**2).sqrt() * noise()
             actions = self.consistency(actions, condition_part, sigma.expand(shape[0])).clamp(-1.0, 1.0)
         return actions
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self(observation, deterministic)
 
 
 class ConsistencyActorPolicy(BaselinePolicy):
@@ -186,7 +175,7 @@ class ConsistencyAC(Baseline):
         online, target = self.actor, self.policy.actor_target
 
         def clean(actor: Any, sigma: th.Tensor) -> th.Tensor:
-            features = actor.extract_features(batch.observations, actor.features_extractor)
+            features = actor.features(batch.observations)
             return actor.consistency(actions + sigma[:, None] * noise, actor.network.condition_in(features), sigma)
 
         with th.no_grad():

@@ -14,41 +14,33 @@ from torch import nn
 
 from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, names_of
 from sb3_ddiffpg.buffers import ModeBatch
+from sb3_ddiffpg.twin_critic_policy import Actor
 
 LOG_STD_RANGE = (-5.0, 5.0)
 
 
-class GaussianActor(BasePolicy):
+class GaussianActor(Actor):
     """
     Squashed Gaussian actor.
 
     :param observation_space: Observation space
     :param action_space: Action space
     :param net_arch: Hidden layers
-    :param features_extractor: Extracts the features of the observation
     :param features_dim: Number of features
     :param activation_fn: Activation of the hidden layers
-    :param normalize_images: Whether images are divided by 255
+    :param kwargs: Of ``Actor``
     """
 
     def __init__(
         self,
         observation_space: spaces.Space,
         action_space: spaces.Box,
-        net_arch: list[int],
-        features_extractor: nn.Module,
         features_dim: int,
+        net_arch: list[int],
         activation_fn: type[nn.Module] = nn.ELU,
-        normalize_images: bool = True,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(
-            observation_space,
-            action_space,
-            features_extractor=features_extractor,
-            normalize_images=normalize_images,
-            squash_output=True,
-        )
-        self.features_dim = features_dim
+        super().__init__(observation_space, action_space, features_dim=features_dim, **kwargs)
         action_dim = get_action_dim(action_space)
         self.latent = nn.Sequential(*create_mlp(features_dim, 2 * action_dim, net_arch, activation_fn))
         self.distribution = SquashedDiagGaussianDistribution(action_dim)
@@ -59,7 +51,7 @@ class GaussianActor(BasePolicy):
         :param deterministic: The squashed mean
         :return: Actions in [-1, 1], [N, action_dim], and their log probabilities, [N]
         """
-        mean, log_std = self.latent(self.extract_features(obs, self.features_extractor)).chunk(2, dim=1)
+        mean, log_std = self.latent(self.features(obs)).chunk(2, dim=1)
         distribution = self.distribution.proba_distribution(mean, log_std.clamp(*LOG_STD_RANGE))
         actions = distribution.get_actions(deterministic)
         return actions, distribution.log_prob(actions, distribution.gaussian_actions)
@@ -71,9 +63,6 @@ class GaussianActor(BasePolicy):
         :return: Actions in [-1, 1], [N, action_dim]
         """
         return self.sample(obs, deterministic)[0]
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self(observation, deterministic)
 
 
 class GaussianActorPolicy(BaselinePolicy):

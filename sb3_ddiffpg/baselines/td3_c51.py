@@ -12,39 +12,31 @@ from torch import nn
 
 from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, names_of
 from sb3_ddiffpg.buffers import ModeBatch
+from sb3_ddiffpg.twin_critic_policy import Actor
 
 
-class TanhActor(BasePolicy):
+class TanhActor(Actor):
     """
     Deterministic actor.
 
     :param observation_space: Observation space
     :param action_space: Action space
     :param net_arch: Hidden layers
-    :param features_extractor: Extracts the features of the observation
     :param features_dim: Number of features
     :param activation_fn: Activation of the hidden layers
-    :param normalize_images: Whether images are divided by 255
+    :param kwargs: Of ``Actor``
     """
 
     def __init__(
         self,
         observation_space: spaces.Space,
         action_space: spaces.Box,
-        net_arch: list[int],
-        features_extractor: nn.Module,
         features_dim: int,
+        net_arch: list[int],
         activation_fn: type[nn.Module] = nn.ELU,
-        normalize_images: bool = True,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(
-            observation_space,
-            action_space,
-            features_extractor=features_extractor,
-            normalize_images=normalize_images,
-            squash_output=True,
-        )
-        self.features_dim = features_dim
+        super().__init__(observation_space, action_space, features_dim=features_dim, **kwargs)
         self.mu = nn.Sequential(
             *create_mlp(features_dim, get_action_dim(action_space), net_arch, activation_fn, squash_output=True)
         )
@@ -55,10 +47,7 @@ class TanhActor(BasePolicy):
         :param deterministic: Not used
         :return: Actions in [-1, 1], [N, action_dim]
         """
-        return self.mu(self.extract_features(obs, self.features_extractor))
-
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self(observation)
+        return self.mu(self.features(obs))
 
 
 class TanhActorPolicy(BaselinePolicy):

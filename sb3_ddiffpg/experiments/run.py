@@ -71,6 +71,7 @@ class CurveCallback(EvaluateModesCallback):
             "hours": round((time.perf_counter() - self._started) / 3600, 4),
             "cpu_hours": round((time.process_time() - self._cpu) / 3600, 4),
             "updates": self.model._n_updates,
+            "cells": len(visits) if (visits := getattr(self.model, "visits", None)) is not None else "",
             "modes": len(getattr(self.model, "modes", ())),
             "commanded_modes": round(found.commanded_modes, 3),
             "expected_modes": round(found.expected_modes(), 3),
