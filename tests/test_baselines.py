@@ -318,6 +318,8 @@ def test_pendulum_is_learnt_as_by_sb3(ours, theirs):
     settings = {"learning_starts": 500, "batch_size": 256, "tau": 0.005, "gamma": 0.98, "learning_rate": 1e-3}
     arch = {"net_arch": [64, 64]}
     own = {"n_atoms": 1, "v_min": -2000.0, "v_max": 0.0, "intrinsic_coef": 0.0, "max_grad_norm": 1e6}
+    if ours is SACC51:  # entropy makes values positive; SB3 tunes its coefficient at the learning rate
+        own |= {"v_max": 2000.0, "entropy_learning_rate": 1e-3}
     if ours is TD3C51:
         own |= {"policy_delay": 2, "actor_tau": 0.005, "target_policy_noise": 0.2, "target_noise_clip": 0.5}
     returns = {}
