@@ -322,7 +322,7 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
             return positions, positions
         obs = self.replay_buffer.normalized(obs, self._vec_normalize_env)
         with th.no_grad():
-            return positions, self.actor.extract_features(obs, self.actor.features_extractor)
+            return positions, self.actor.features(obs)
 
     def _update_critics(self, batch: ModeBatch, rewards: th.Tensor) -> th.Tensor:
         policy, shape = self.policy, batch.actions.shape

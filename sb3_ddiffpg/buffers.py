@@ -183,7 +183,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             self._steps.write(name, rows, action)
         self.foreign[rows] = self.off_route[rows] = False
         self.way_novelty[rows] = 0.0
-        self._last_positions = self.features(next_obs).copy()  # the environments may write into theirs
+        self._last_positions = self.features(next_obs)
 
     def _evict(self) -> Trajectory:
         trajectory = super()._evict()

@@ -84,9 +84,9 @@ class Baseline(NoveltyActorCritic):
         self.actor.optimizer.step()
         return loss.detach()
 
-    def _values(self, batch: ModeBatch, actions: th.Tensor, frozen: bool = True) -> th.Tensor:
+    def _values(self, batch: ModeBatch, actions: th.Tensor) -> th.Tensor:
         """Values of actions [n, action_dim] by each critic, [C, n]; the critics' weights are constants."""
         with th.no_grad():
             features = self.policy.critic_features(batch.observations)
         critics = self.policy.critics
-        return critics.values(critics(features, actions[None], frozen=frozen))[0]
+        return critics.values(critics(features, actions[None], frozen=True))[0]

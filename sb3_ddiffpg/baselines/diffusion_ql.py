@@ -55,6 +55,7 @@ class DiffusionQL(Baseline):
         self.n_candidates = n_candidates
         self.average_freq = average_freq
         self.average_start = average_start
+        self._n_actor_updates = 0
         super().__init__(policy, env, actor_tau=actor_tau, **kwargs)
 
     def _policy_arguments(self) -> dict[str, Any]:
@@ -78,8 +79,6 @@ class DiffusionQL(Baseline):
         elif self._n_actor_updates % self.average_freq:
             return
         super()._average_actor(tau)
-
-    _n_actor_updates = 0
 
     def predict(
         self,

@@ -24,7 +24,7 @@ from typing import Any
 import gymnasium as gym
 import torch as th
 import yaml
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.callbacks import EvaluateModesCallback
 from sb3_ddiffpg.envs import is_ours
@@ -157,20 +157,13 @@ def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: 
     if curve.best_step is None:
         shutil.copy(folder / "logs" / "final_model.zip", folder / "model.zip")
     for name, path in (("final", folder / "logs" / "final_model.zip"), ("best", folder / "model.zip")):
-        statistics = path.with_name("vecnormalize.pkl")
-        env = VecNormalize.load(str(statistics), unwrap(test_env)) if name == "best" and statistics.exists() else test_env
+        statistics, env = path.with_name("vecnormalize.pkl"), test_env
+        if isinstance(test_env, VecNormalize) and statistics.exists():  # beside the best model only
+            env = VecNormalize.load(str(statistics), test_env.venv)
         found = evaluate_modes(ALGOS[algo].load(path), env, N_EPISODES, seed=seed + 1_000)
         found.save(folder / ("evaluation.json" if name == "best" else "logs/evaluation_final.json"))
         print(f"\n{name} model\n{found}")
     test_env.close()
-
-
-def unwrap(env: VecEnv) -> VecEnv:
-    """
-    :param env: Environments
-    :return: Those that its outermost ``VecNormalize`` normalises, else the same
-    """
-    return env.venv if isinstance(env, VecNormalize) else env
 
 
 def _git_commit() -> str | None:
