@@ -1,16 +1,17 @@
 """What the baselines share: one group of critics, a first-in-first-out buffer, and a target actor for those that have one."""
 
 import copy
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
+from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sb3_ddiffpg.actor_critic import NoveltyActorCritic
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.trajectories import Trajectory
-from sb3_ddiffpg.twin_critic_policy import TwinCriticPolicy
+from sb3_ddiffpg.twin_critic_policy import Actor, TwinCriticPolicy
 
 
 class FifoReplayBuffer(ModeReplayBuffer):
@@ -35,6 +36,32 @@ class BaselinePolicy(TwinCriticPolicy):
         self.actor.optimizer = optimizer
         self.actor_target.set_training_mode(False)
         self.actor_target.requires_grad_(False)
+
+
+class MlpActorPolicy(BaselinePolicy):
+    """
+    A ``BaselinePolicy`` whose actor is one network. A subclass says of which class.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate of the actor
+    :param activation_fn: Activation of the actor
+    :param kwargs: Of ``TwinCriticPolicy``
+    """
+
+    actor_class: ClassVar[type[Actor]]
+
+    def __init__(
+        self,
+        observation_space: Any,
+        action_space: Any,
+        lr_schedule: Any,
+        activation_fn: type[nn.Module] = nn.ELU,
+        **kwargs: Any,
+    ) -> None:
+        actor_kwargs = dict(activation_fn=activation_fn)
+        super().__init__(observation_space, action_space, lr_schedule, self.actor_class, actor_kwargs, **kwargs)
+        self._constructor.update(actor_kwargs)
 
 
 def names_of(policy_class: type[BaselinePolicy]) -> dict[str, type[BasePolicy]]:

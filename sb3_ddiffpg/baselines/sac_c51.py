@@ -12,7 +12,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, names_of
+from sb3_ddiffpg.baselines.baseline import Baseline, MlpActorPolicy, names_of
 from sb3_ddiffpg.buffers import ModeBatch
 from sb3_ddiffpg.twin_critic_policy import Actor
 
@@ -65,29 +65,14 @@ class GaussianActor(Actor):
         return self.sample(obs, deterministic)[0]
 
 
-class GaussianActorPolicy(BaselinePolicy):
-    """
-    Twin critics and a squashed Gaussian actor.
+class GaussianActorPolicy(MlpActorPolicy):
+    """Twin critics and a squashed Gaussian actor, with the factor of its entropy."""
 
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param lr_schedule: Learning rate of the actor
-    :param activation_fn: Activation of the actor
-    :param kwargs: Of ``TwinCriticPolicy``
-    """
+    actor_class = GaussianActor
 
-    def __init__(
-        self,
-        observation_space: Any,
-        action_space: Any,
-        lr_schedule: Any,
-        activation_fn: type[nn.Module] = nn.ELU,
-        **kwargs: Any,
-    ) -> None:
-        actor_kwargs = dict(activation_fn=activation_fn)
-        super().__init__(observation_space, action_space, lr_schedule, GaussianActor, actor_kwargs, **kwargs)
-        self._constructor.update(actor_kwargs)
-        # Of the entropy; tuned by the algorithm
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        # Tuned by the algorithm
         self.log_entropy_coef = nn.Parameter(th.zeros(()))
 
 

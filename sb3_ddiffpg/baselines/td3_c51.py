@@ -10,7 +10,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, names_of
+from sb3_ddiffpg.baselines.baseline import Baseline, MlpActorPolicy, names_of
 from sb3_ddiffpg.buffers import ModeBatch
 from sb3_ddiffpg.twin_critic_policy import Actor
 
@@ -50,28 +50,10 @@ class TanhActor(Actor):
         return self.mu(self.features(obs))
 
 
-class TanhActorPolicy(BaselinePolicy):
-    """
-    Twin critics and a deterministic actor.
+class TanhActorPolicy(MlpActorPolicy):
+    """Twin critics and a deterministic actor."""
 
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param lr_schedule: Learning rate of the actor
-    :param activation_fn: Activation of the actor
-    :param kwargs: Of ``TwinCriticPolicy``
-    """
-
-    def __init__(
-        self,
-        observation_space: Any,
-        action_space: Any,
-        lr_schedule: Any,
-        activation_fn: type[nn.Module] = nn.ELU,
-        **kwargs: Any,
-    ) -> None:
-        actor_kwargs = dict(activation_fn=activation_fn)
-        super().__init__(observation_space, action_space, lr_schedule, TanhActor, actor_kwargs, **kwargs)
-        self._constructor.update(actor_kwargs)
+    actor_class = TanhActor
 
 
 class TD3C51(Baseline):
