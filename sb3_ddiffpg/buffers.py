@@ -45,7 +45,7 @@ class ModeBatch(NamedTuple):
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
     *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct", "loop_share", "route_share"),
-    "new_way_share",
+    *("new_way_share", "explore_beyond_goals"),
 )
 
 
@@ -76,6 +76,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     :param route_share: Distance beyond which a step is off a mode's route, as a share of the route's extent
     :param new_way_share: Share of the exploratory group's rows that are drawn from trajectories which reached a goal by a way
         of which a mode has not its fill
+    :param explore_beyond_goals: Whether a goal does not end the exploratory group's returns
     :raises ValueError: If a size is not positive or ``optimize_memory_usage`` is asked for
     """
 
@@ -84,6 +85,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     foreign: np.ndarray
     off_route: np.ndarray
     way_novelty: np.ndarray
+    goals: np.ndarray
 
     def __init__(
         self,
@@ -106,6 +108,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         loop_share: float = 0.05,
         route_share: float = 0.1,
         new_way_share: float = 0.0,
+        explore_beyond_goals: bool = False,
     ) -> None:
         for name, value, least in (
             ("max_successes_per_mode", max_successes_per_mode, 1),
@@ -129,6 +132,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.loop_share = loop_share
         self.route_share = route_share
         self.new_way_share = new_way_share
+        self.explore_beyond_goals = explore_beyond_goals
         super().__init__(
             buffer_size,
             observation_space,
@@ -159,10 +163,12 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         return {**super()._step_fields(), "target_actions": action, "exploratory_target_actions": action}
 
     def _note_fields(self) -> Fields:
-        return {**super()._note_fields(), "foreign": ((), bool), "off_route": ((), bool), "way_novelty": ((), np.float32)}
+        own = {"foreign": ((), bool), "off_route": ((), bool), "way_novelty": ((), np.float32), "goals": ((), bool)}
+        return {**super()._note_fields(), **own}
 
     def _view_names(self) -> list[str]:
-        return [*super()._view_names(), "target_actions", "exploratory_target_actions", "foreign", "off_route", "way_novelty"]
+        own = ["target_actions", "exploratory_target_actions", "foreign", "off_route", "way_novelty", "goals"]
+        return [*super()._view_names(), *own]
 
     def _position_arrays(self) -> list[np.ndarray]:
         return [*super()._position_arrays(), self._mode_position]
@@ -172,7 +178,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.target_actions = self._steps["target_actions"]
         self.exploratory_target_actions = self._steps["exploratory_target_actions"]
         self.foreign, self.off_route = self._notes["foreign"], self._notes["off_route"]
-        self.way_novelty = self._notes["way_novelty"]
+        self.way_novelty, self.goals = self._notes["way_novelty"], self._notes["goals"]
         self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
         for row_set in self.mode_rows:
             row_set.position = self._mode_position
@@ -181,9 +187,14 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         super()._write_rows(rows, obs, next_obs, action, *args)
         for name in ("target_actions", "exploratory_target_actions"):
             self._steps.write(name, rows, action)
-        self.foreign[rows] = self.off_route[rows] = False
+        self.foreign[rows] = self.off_route[rows] = self.goals[rows] = False
         self.way_novelty[rows] = 0.0
         self._last_positions = self.features(next_obs)
+
+    def _finish(self, env: int, info: dict[str, Any]) -> Trajectory:
+        trajectory = super()._finish(env, info)
+        self.goals[trajectory.rows[-1]] = trajectory.success
+        return trajectory
 
     def _evict(self) -> Trajectory:
         trajectory = super()._evict()
@@ -435,6 +446,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         ends = lengths[..., None] - 1
         last = np.take_along_axis(windows, ends, axis=-1).ravel()
         ended = np.take_along_axis(notes["dones"] & ~notes["timeouts"], ends, axis=-1)[..., 0]
+        if self.explore_beyond_goals:
+            # A goal that ended what exploring is worth would be the one place that explorers keep away from
+            ended[EXPLORATORY_GROUP] &= ~np.take_along_axis(notes["goals"], ends, axis=-1)[EXPLORATORY_GROUP, :, 0]
         discounts = np.float32(gamma) ** lengths * ~(ended | lost.any(axis=-1))
         steps = self._on_device(self._steps.tensors(rows.ravel()))
         nexts = self._on_device(self._nexts.tensors(last))

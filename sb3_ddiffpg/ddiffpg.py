@@ -100,6 +100,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param exploration_fraction: Part of the training that explores, when ``exploration_share`` is None
     :param explore_then_exploit: Share of the exploring episodes that hand over to a mode or the zero embedding after a random
         time (on average the modes' mean length), so that they come to a goal by a way that no mode would have taken
+    :param explore_beyond_goals: Whether a goal does not end the exploratory critics' returns: novelty is not episodic
+        (Burda et al., 2018, section 2.3), and explorers would keep away from where it ends
     :param novelty: ``"rnd"``, ``"counts"``, or a class with the methods of ``RandomNetworkDistillation``
     :param novelty_kwargs: Further keyword arguments of the novelty measure
     :param novelty_scale: The factor alpha of NovelD
@@ -183,6 +185,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         exploration_share: float | Schedule | None = None,
         exploration_fraction: float = 0.7,
         explore_then_exploit: float = 0.5,
+        explore_beyond_goals: bool = True,
         novelty: str | type = "counts",
         novelty_kwargs: dict[str, Any] | None = None,
         novelty_scale: float = 0.5,
@@ -265,6 +268,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         self.exploration_share = exploration_share
         self.exploration_fraction = exploration_fraction
         self.explore_then_exploit = explore_then_exploit
+        self.explore_beyond_goals = explore_beyond_goals
         self.mode_intrinsic_coef = mode_intrinsic_coef
         self.new_way_coef = new_way_coef
         self.reset_new_critics = reset_new_critics
@@ -298,6 +302,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             **super()._buffer_arguments(),
             "max_successes_per_mode": self.max_successes_per_mode,
             "max_failures_per_mode": self.max_failures_per_mode,
+            "explore_beyond_goals": self.explore_beyond_goals,
             "new_way_share": NEW_WAY_SHARE if self.new_way_coef else 0.0,
         }
 

@@ -27,6 +27,7 @@ from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.callbacks import ModeEvalCallback
 from sb3_ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import is_ours, make_vec_env
+from sb3_ddiffpg.schedules import LateLinearSchedule
 
 try:
     import optuna
@@ -55,6 +56,8 @@ ZOO_KEYS = {
     "normalize",
     "vec_env_wrapper",
 }
+# How a learning rate may be given: 3e-4, `lin_3e-4`, `late_3e-4`
+SCHEDULES: dict[str, Callable[[float], Any]] = {"": float, "lin": SimpleLinearSchedule, "late": LateLinearSchedule}
 # Constructor arguments that come from the command line
 COMMAND_LINE_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
 
@@ -128,15 +131,19 @@ class ModeExperimentManager(ExperimentManager):
 
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
-        # The zoo knows `lin_3e-4` for the learning rate alone, and YAML reads 3e-4 as a string
-        value = hyperparams.get("qf_learning_rate")
-        if isinstance(value, str):
-            try:
-                number = float(value.removeprefix("lin_"))
-            except ValueError:
-                raise TypeError(f"qf_learning_rate must be a number or 'lin_<number>', got {value!r}") from None
-            hyperparams["qf_learning_rate"] = SimpleLinearSchedule(number) if value.startswith("lin_") else number
-        return ExperimentManager._preprocess_schedules(hyperparams)
+        # The zoo knows `lin_3e-4` for the learning rate alone, takes every name for `lin`, and YAML reads 3e-4 as a string
+        schedules = {}
+        for key in ("learning_rate", "qf_learning_rate"):
+            value = hyperparams.get(key)
+            if isinstance(value, str):
+                kind, _, number = value.rpartition("_")
+                try:
+                    schedules[key] = SCHEDULES[kind](float(number))
+                except (KeyError, ValueError):
+                    accepted = "a number, 'lin_<number>' or 'late_<number>'"
+                    raise TypeError(f"{key} must be {accepted}, got {value!r}") from None
+        others = {key: value for key, value in hyperparams.items() if key not in schedules}
+        return {**ExperimentManager._preprocess_schedules(others), **schedules}
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         model = super()._load_pretrained_agent(hyperparams, env)
