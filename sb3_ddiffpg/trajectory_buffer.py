@@ -394,7 +394,14 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         :param env: Normalises observations and rewards when given
         :return: SB3's samples
         """
-        rows = self._all.sample(batch_size)
+        return self.read(self._all.sample(batch_size), env)
+
+    def read(self, rows: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """
+        :param rows: Shape [N]
+        :param env: Normalises observations and rewards when given
+        :return: Their transitions, as SB3's samples
+        """
         steps = self._on_device(self._steps.tensors(rows))
         nexts = self._on_device(self._nexts.tensors(rows))
         dones = (self.dones[rows] & ~self.timeouts[rows]).astype(np.float32)

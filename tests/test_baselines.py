@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ddiffpg import DDiffPG
-from sb3_ddiffpg.baselines import BASELINES, DIPO, SACC51, TD3C51, ConsistencyAC, DiffusionQL
+from sb3_ddiffpg.baselines import BASELINES, DIPO, RPG, SACC51, TD3C51, ConsistencyAC, DiffusionQL
 from sb3_ddiffpg.baselines.consistency_ac import SIGMA_MAX, SIGMA_MIN, karras_sigmas
 from sb3_ddiffpg.diffusion import variance_preserving_betas
 from sb3_ddiffpg.evaluation import evaluate_modes
@@ -37,7 +37,7 @@ def algorithm(request):
 
 
 def test_saves_loads_and_goes_on(algorithm, tmp_path):
-    model = small(algorithm, actor_tau=0.1)
+    model = small(algorithm, **({} if algorithm is RPG else {"actor_tau": 0.1}))
     model.learn(200)
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
@@ -100,9 +100,10 @@ def test_modes_are_counted_without_commands(algorithm):
 
 
 @pytest.mark.parametrize("n_steps", [1, 3])
-def test_rewards_are_the_environments_and_what_is_new(algorithm, n_steps):
+@pytest.mark.parametrize("model_free", [each for each in BASELINES.values() if each is not RPG])
+def test_rewards_are_the_environments_and_what_is_new(model_free, n_steps):
     """Both discounted over the steps of a return."""
-    model = small(algorithm, n_steps=n_steps, reward_scale=3.0, normalize_intrinsic=False, gamma=0.9)
+    model = small(model_free, n_steps=n_steps, reward_scale=3.0, normalize_intrinsic=False, gamma=0.9)
     model.learn(100)
     seen = {}
     model._update_critics = lambda batch, rewards: seen.update(batch=batch, rewards=rewards) or th.zeros(())

@@ -28,7 +28,8 @@ def make_buffer(buffer_size=200, n_envs=1, observation_space=OBSERVATION, **kwar
 class PlainBuffer:
     """What ModeReplayBuffer promises, with lists of dicts and no regard for speed. A step is known by its number."""
 
-    def __init__(self, size, n_envs, max_successes, max_failures):
+    def __init__(self, size, n_envs, max_successes, max_failures, explore_beyond_goals):
+        self.explore_beyond_goals = explore_beyond_goals
         self.size, self.limits = size, {True: max_successes, False: max_failures}
         self.running = [[] for _ in range(n_envs)]
         self.episodes = []
@@ -108,7 +109,7 @@ class PlainBuffer:
     def window(self, number, n_steps, for_mode):
         """
         n-step reward, discount and the last step of the window that begins with a step. For a mode, a step off its route is
-        the end, without reward.
+        the end, without reward; for exploration a goal is none if it shall go on beyond.
         """
         episodes = [e["steps"] for e in self.episodes] + self.running
         steps = next(e for e in episodes if any(step["number"] == number for step in e))
@@ -118,21 +119,22 @@ class PlainBuffer:
             lost = lost or (for_mode and last["off_route"])
             reward += 0.0 if lost else discount * last["reward"]
             discount *= GAMMA
-        return reward, 0.0 if lost or (last["done"] and not last["timeout"]) else discount, last
+        ended = last["done"] and not last["timeout"] and not (last["goal"] and self.explore_beyond_goals and not for_mode)
+        return reward, 0.0 if lost or ended else discount, last
 
 
 class BufferMachine(RuleBasedStateMachine):
     """Random steps, clusterings, improved target actions and interruptions; both buffers must hold the same after each."""
 
-    @initialize(n_envs=st.integers(1, 3), seed=st.integers(0, 2**16), spare=st.integers(0, 40))
-    def start(self, n_envs, seed, spare):
+    @initialize(n_envs=st.integers(1, 3), seed=st.integers(0, 2**16), spare=st.integers(0, 40), beyond=st.booleans())
+    def start(self, n_envs, seed, spare, beyond):
         self.rng = np.random.default_rng(seed)
         np.random.seed(seed)
         self.n_envs, self.longest, self.number, self.most_modes = n_envs, 6, 0, 3
         # Room for the episodes in progress, and for the one success of each mode that is never evicted
         size = self.longest * (n_envs + self.most_modes) + spare
-        self.buffer = make_buffer(size, n_envs, max_successes_per_mode=4, max_failures_per_mode=2)
-        self.plain = PlainBuffer(size, n_envs, 4, 2)
+        self.buffer = make_buffer(size, n_envs, max_successes_per_mode=4, max_failures_per_mode=2, explore_beyond_goals=beyond)
+        self.plain = PlainBuffer(size, n_envs, 4, 2, beyond)
 
     def stored(self):
         """Number of every stored step -> its row."""
@@ -172,6 +174,7 @@ class BufferMachine(RuleBasedStateMachine):
                 "reward": float(rewards[env]),
                 "done": bool(dones[env]),
                 "timeout": bool(timeouts[env]),
+                "goal": bool(successes[env]),
                 "off_route": False,
             }
             self.plain.add(env, step, dones[env], bool(successes[env]))

@@ -230,13 +230,16 @@ def test_other_algorithms_keep_their_configuration(tmp_path):
     assert config["policy"] == "MlpPolicy"
 
 
-def test_qf_learning_rate_as_text():
+def test_learning_rates_as_text():
     parse = ModeExperimentManager._preprocess_schedules
     assert parse({"qf_learning_rate": "lin_3e-4"})["qf_learning_rate"](0.5) == pytest.approx(1.5e-4)
     assert parse({"qf_learning_rate": "3e-4"})["qf_learning_rate"] == pytest.approx(3e-4)
     assert parse({"qf_learning_rate": 3e-4, "learning_rate": "lin_1e-3"})["learning_rate"](0.5) == pytest.approx(5e-4)
-    with pytest.raises(TypeError, match="qf_learning_rate must be a number or 'lin_<number>', got 'fast'"):
-        parse({"qf_learning_rate": "fast"})
+    late = parse({"learning_rate": "late_1e-3"})["learning_rate"]
+    assert [late(remaining) for remaining in (1.0, 0.3, 0.15, 0.0)] == pytest.approx([1e-3, 1e-3, 5e-4, 0.0])
+    for key, value in (("qf_learning_rate", "fast"), ("learning_rate", "cos_1e-3"), ("learning_rate", "lin_fast")):
+        with pytest.raises(TypeError, match=f"{key} must be a number, 'lin_<number>' or 'late_<number>', got '{value}'"):
+            parse({key: value})
 
 
 @pytest.mark.parametrize("name", ["ddiffpg", "ddiffpg-cpu", *BASELINES])

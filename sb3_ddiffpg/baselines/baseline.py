@@ -64,7 +64,7 @@ class MlpActorPolicy(BaselinePolicy):
         self._constructor.update(actor_kwargs)
 
 
-def names_of(policy_class: type[BaselinePolicy]) -> dict[str, type[BasePolicy]]:
+def names_of(policy_class: type[BasePolicy]) -> dict[str, type[BasePolicy]]:
     """
     :param policy_class: A baseline's policy, which takes any observations
     :return: SB3's names for it

@@ -51,7 +51,15 @@ class GaussianActor(Actor):
         :param deterministic: The squashed mean
         :return: Actions in [-1, 1], [N, action_dim], and their log probabilities, [N]
         """
-        mean, log_std = self.latent(self.features(obs)).chunk(2, dim=1)
+        return self.sample_from(self.features(obs), deterministic)
+
+    def sample_from(self, features: th.Tensor, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param features: Shape [N, features_dim]
+        :param deterministic: The squashed mean
+        :return: See ``sample``
+        """
+        mean, log_std = self.latent(features).chunk(2, dim=1)
         distribution = self.distribution.proba_distribution(mean, log_std.clamp(*LOG_STD_RANGE))
         actions = distribution.get_actions(deterministic)
         return actions, distribution.log_prob(actions, distribution.gaussian_actions)

@@ -1,0 +1,517 @@
+"""Reparameterised policy gradient: a policy with a latent variable, improved through a model of the task."""
+
+import copy
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    create_mlp,
+    get_actor_critic_arch,
+)
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+from torch.nn import functional as F
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+
+from sb3_ddiffpg.actor_critic import NoveltyActorCritic
+from sb3_ddiffpg.baselines.baseline import FifoReplayBuffer, names_of
+from sb3_ddiffpg.baselines.sac_c51 import GaussianActor
+from sb3_ddiffpg.baselines.world_model import WorldModel
+from sb3_ddiffpg.features import ScaledFlattenExtractor
+
+
+class LatentActor(GaussianActor):
+    """
+    Squashed Gaussian actor that sees a latent state and the episode's latent variable.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param features_extractor: Features of an observation; the actor itself does not look at them
+    :param features_dim: Their number
+    :param input_dim: Size of a latent state and the variable together
+    :param net_arch: Hidden layers
+    :param kwargs: Of ``GaussianActor``
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        features_extractor: nn.Module,
+        features_dim: int,
+        input_dim: int,
+        net_arch: list[int],
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, input_dim, net_arch, features_extractor=features_extractor, **kwargs)
+        self.features_dim = features_dim
+
+
+class LatentInference(nn.Module):
+    """
+    Which latent variable an action in a state speaks of: a Gaussian q(z | s, a).
+
+    :param input_dim: Size of a latent state and an action together
+    :param latent_dim: Size Z of the variable
+    :param net_arch: Hidden layers
+    :param activation_fn: Their activation
+    """
+
+    def __init__(self, input_dim: int, latent_dim: int, net_arch: list[int], activation_fn: type[nn.Module]) -> None:
+        super().__init__()
+        self.net = nn.Sequential(*create_mlp(input_dim, 2 * latent_dim, net_arch, activation_fn))
+
+    def log_ratio(self, states: th.Tensor, actions: th.Tensor, latents: th.Tensor) -> th.Tensor:
+        """
+        :param states: Latent states, [N, L]
+        :param actions: [N, A]
+        :param latents: Values of the variable, [N, Z]
+        :return: log q(z | s, a) - log p(z), [N]: what was learned about z
+        """
+        mean, log_std = self.net(th.cat((states, actions), dim=1)).chunk(2, dim=1)
+        log_std = log_std.clamp(-5.0, 2.0)
+        posterior = th.distributions.Normal(mean, log_std.exp(), validate_args=False)
+        prior = th.distributions.Normal(th.zeros_like(mean), 1.0, validate_args=False)
+        return (posterior.log_prob(latents) - prior.log_prob(latents)).sum(dim=1)
+
+
+class RPGPolicy(BasePolicy):
+    """
+    An actor pi(a | s, z), the model in which it is improved, and the inference of z.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate of the actor
+    :param net_arch: Hidden layers, a list or ``dict(pi=[...], qf=[...])``; ``qf`` are the model's
+    :param activation_fn: Activation of all networks
+    :param features_extractor_class: Features extractor; scales bounded observations when None, combines dict observations
+    :param features_extractor_kwargs: Its keyword arguments
+    :param normalize_images: Whether images are divided by 255
+    :param optimizer_class: Optimiser of all networks
+    :param optimizer_kwargs: Its keyword arguments, without the learning rate
+    :param state_dim: Size L of a latent state
+    :param latent_dim: Size Z of the latent variable
+    :param n_critics: Values for each state
+    :param support: Lower and upper end of the values
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ELU,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        state_dim: int = 100,
+        latent_dim: int = 12,
+        n_critics: int = 2,
+        support: tuple[float, float] = (0.0, 5.0),
+    ) -> None:
+        if features_extractor_class is None:
+            is_dict = isinstance(observation_space, spaces.Dict)
+            features_extractor_class = CombinedExtractor if is_dict else ScaledFlattenExtractor
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class,
+            features_extractor_kwargs,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            squash_output=True,
+            normalize_images=normalize_images,
+        )
+        self._constructor: dict[str, Any] = dict(
+            net_arch=net_arch,
+            activation_fn=activation_fn,
+            state_dim=state_dim,
+            latent_dim=latent_dim,
+            n_critics=n_critics,
+            support=support,
+        )
+        self.latent_dim = latent_dim
+        actor_arch, model_arch = get_actor_critic_arch([128, 128] if net_arch is None else net_arch)
+        action_dim = int(np.prod(action_space.shape))
+        extractor = self.make_features_extractor()
+        self.model = WorldModel(
+            extractor,
+            extractor.features_dim,
+            action_dim,
+            latent_dim,
+            model_arch,
+            state_dim,
+            activation_fn,
+            n_critics,
+            support,
+        )
+        self.model_target = copy.deepcopy(self.model)
+        self.model_target.train(False)
+        self.model_target.requires_grad_(False)
+        self.actor = LatentActor(
+            observation_space,
+            action_space,
+            self.make_features_extractor(),
+            extractor.features_dim,
+            state_dim + latent_dim,
+            actor_arch,
+            activation_fn=activation_fn,
+            normalize_images=normalize_images,
+        )
+        self.inference = LatentInference(state_dim + action_dim, latent_dim, model_arch, activation_fn)
+        # Tuned by the algorithm
+        self.log_entropy_coef = nn.Parameter(th.zeros(()))
+        make: Any = optimizer_class
+        learnt = [*self.actor.latent.parameters(), *self.inference.parameters()]
+        self.actor.optimizer = make(learnt, lr=lr_schedule(1), **self.optimizer_kwargs)
+        self.critics.optimizer = make(self.model.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+        self._latents_in_use: th.Tensor | None = None
+
+    @property
+    def critics(self) -> Any:
+        """The model's values; their optimiser is that of the whole model."""
+        return self.model.critics
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            self._constructor,
+            lr_schedule=self._dummy_schedule,
+            optimizer_class=self.optimizer_class,
+            optimizer_kwargs=self.optimizer_kwargs,
+            features_extractor_class=self.features_extractor_class,
+            features_extractor_kwargs=self.features_extractor_kwargs,
+        )
+        return data
+
+    def encode(self, obs: PyTorchObs, target: bool = False) -> th.Tensor:
+        """
+        :param obs: Observations, [N, ...]
+        :param target: By the target model
+        :return: Latent states, [N, L]
+        """
+        model = self.model_target if target else self.model
+        return model.encoder(self.extract_features(obs, model.features_extractor))
+
+    def draw_latents(self, n: int) -> th.Tensor:
+        """
+        :param n: How many
+        :return: Latent variables from their prior, [n, Z]
+        """
+        return th.randn(n, self.latent_dim, device=self.device)
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self._predict(obs, deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        states = self.encode(observation)
+        latents = self._latents_in_use
+        if latents is None:
+            latents = states.new_zeros(len(states), self.latent_dim) if deterministic else self.draw_latents(len(states))
+        return self.actor.sample_from(th.cat((states, latents), dim=1), deterministic)[0]
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+        latents: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        :param observation: The observation(s)
+        :param state: What the previous call returned: the latent variable of every environment's episode
+        :param episode_start: Which environments begin an episode and so draw a new one
+        :param deterministic: The mean action; without ``state`` and ``episode_start`` also the latent variable's mean
+        :param latents: The latent variables to follow, [Z] or [N, Z]; they are drawn when None
+        :return: The actions and the state for the next call
+        """
+        if latents is not None:
+            latents = np.atleast_2d(np.asarray(latents, dtype=np.float32))
+        elif state is not None or episode_start is not None:
+            latents = self.draw_latents(len(state[0] if episode_start is None else np.atleast_1d(episode_start))).cpu().numpy()  # type: ignore[index]
+            if state is not None:
+                starts = False if episode_start is None else np.atleast_1d(episode_start).astype(bool)[:, None]
+                latents = np.where(starts, latents, state[0])
+        if latents is not None:
+            n_obs = self.obs_to_tensor(observation)[0]
+            n_rows = len(next(iter(n_obs.values())) if isinstance(n_obs, dict) else n_obs)
+            if latents.shape not in ((1, self.latent_dim), (n_rows, self.latent_dim)):
+                raise ValueError(f"latents must be of shape [{n_rows}, {self.latent_dim}], got {list(latents.shape)}")
+            latents = np.broadcast_to(latents, (n_rows, self.latent_dim)).copy()
+            state = (latents,)
+            self._latents_in_use = th.from_numpy(latents).to(self.device)
+        try:
+            return super().predict(observation, state, episode_start, deterministic)
+        finally:
+            self._latents_in_use = None
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        :param mode: True for training, False for evaluation (dropout, batch norm of the extractors)
+        """
+        self.actor.set_training_mode(mode)
+        self.model.train(mode)
+        self.inference.train(mode)
+        self.training = mode
+
+
+@dataclass
+class Segments:
+    """
+    Consecutive steps of B episodes, at most H each.
+
+    :param observations: Where they begin, [B, ...]
+    :param actions: Shape [B, H, A]
+    :param next_observations: Shape [B * H, ...]
+    :param rewards: Scaled, and what was new, [B, H]
+    :param ended: Whether the episode ended there, [B, H]
+    :param present: 0 beyond a segment's end, [B, H]
+    """
+
+    observations: Any
+    actions: th.Tensor
+    next_observations: Any
+    rewards: th.Tensor
+    ended: th.Tensor
+    present: th.Tensor
+
+
+class RPG(NoveltyActorCritic):
+    """
+    Reparameterised policy gradient (Huang et al., 2023, https://arxiv.org/abs/2307.10710): each episode draws a latent
+    variable z, which the policy pi(a | s, z) sees. The policy climbs the lambda-return of its own rollouts in a learned model,
+    plus the entropy of its actions and what they tell about z, so that different z act differently. Deviations are listed in
+    ``docs/baselines.md``.
+
+    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param horizon: Steps H of rollouts in the model, and of the segments from which it learns
+    :param gae_lambda: Weight lambda of longer returns
+    :param latent_dim: Size of the latent variable
+    :param latent_coef: Factor of log q(z | s, a) - log p(z) in the reward
+    :param reward_loss_coef: Factor of the reward's squared error in the model's loss
+    :param value_loss_coef: Factor of the values' squared error
+    :param state_loss_coef: Factor of the latent states' squared error
+    :param target_update_interval: Updates between two steps of the target model
+    :param entropy_learning_rate: Learning rate of the entropy's factor
+    :param initial_entropy_coef: Its first value
+    :param target_entropy: Entropy that it aims at; None: minus the action's size
+    :param tau: As in ``NoveltyActorCritic``
+    :param n_atoms: Values are scalar: only 1
+    :param kwargs: Of ``NoveltyActorCritic``
+    :raises ValueError: If an argument is out of its range, naming it
+    """
+
+    default_replay_buffer_class = FifoReplayBuffer
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(RPGPolicy)
+    policy: RPGPolicy  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: Any,
+        *,
+        horizon: int = 3,
+        gae_lambda: float = 0.97,
+        latent_dim: int = 12,
+        latent_coef: float = 0.005,
+        reward_loss_coef: float = 10.0,
+        value_loss_coef: float = 1.0,
+        state_loss_coef: float = 100.0,
+        target_update_interval: int = 2,
+        entropy_learning_rate: float = 3e-4,
+        initial_entropy_coef: float = 0.01,
+        target_entropy: float | None = None,
+        tau: float = 0.01,
+        n_atoms: int = 1,
+        **kwargs: Any,
+    ) -> None:
+        if n_atoms != 1:
+            raise ValueError(f"n_atoms must be 1, RPG's values are scalar, got {n_atoms!r}")
+        self.horizon = horizon
+        self.gae_lambda = gae_lambda
+        self.latent_dim = latent_dim
+        self.latent_coef = latent_coef
+        self.reward_loss_coef = reward_loss_coef
+        self.value_loss_coef = value_loss_coef
+        self.state_loss_coef = state_loss_coef
+        self.target_update_interval = target_update_interval
+        self.entropy_learning_rate = entropy_learning_rate
+        self.initial_entropy_coef = initial_entropy_coef
+        self.target_entropy = target_entropy
+        self._n_model_updates = 0
+        self._episode_latents = np.empty((0, latent_dim), dtype=np.float32)
+        super().__init__(policy, env, tau=tau, n_atoms=n_atoms, **kwargs)
+
+    # ------------------------------------------------------------------ set-up
+
+    def _policy_arguments(self) -> dict[str, Any]:
+        return {"latent_dim": self.latent_dim, "n_critics": self.n_critics, "support": (self.v_min, self.v_max)}
+
+    def _setup_model(self) -> None:
+        no_noise = self.action_noise is None
+        super()._setup_model()
+        if no_noise:
+            self.action_noise = None  # its own noise explores
+        with th.no_grad():
+            self.policy.log_entropy_coef.fill_(float(np.log(self.initial_entropy_coef)))
+        self.entropy_optimizer = th.optim.Adam([self.policy.log_entropy_coef], lr=self.entropy_learning_rate)
+
+    @property
+    def entropy_coef(self) -> th.Tensor:
+        """The factor alpha of the entropy, a scalar."""
+        return self.policy.log_entropy_coef.detach().exp()
+
+    # ------------------------------------------------------------------ learning
+
+    def train(self, gradient_steps: int, batch_size: int) -> None:
+        """
+        :param gradient_steps: Number of updates
+        :param batch_size: Segments per update
+        """
+        self._begin_updates()
+        metrics: dict[str, list[th.Tensor]] = defaultdict(list)
+        for _ in range(gradient_steps):
+            segments = self._sample_segments(batch_size, metrics)
+            self._update_model(segments, metrics)
+            self._update_policy(segments, metrics)
+            self._update_targets()
+        self._end_updates(gradient_steps, metrics)
+
+    def _sample_segments(self, batch_size: int, metrics: dict[str, list[th.Tensor]]) -> Segments:
+        buffer, env = self.replay_buffer, self._vec_normalize_env
+        windows = buffer.sample_modes(batch_size, self.gamma, self.horizon, 1, env=env).windows[0]  # [B, H]
+        present = windows >= 0
+        rows = np.where(present, windows, windows[:, :1]).ravel()
+        steps = buffer.read(rows, env)
+        shape = windows.shape
+        intrinsic = self._intrinsic_rewards(np.where(present, windows, -1).reshape(1, -1, 1), metrics)
+
+        def first(part: th.Tensor) -> th.Tensor:
+            return part.unflatten(0, shape)[:, 0]
+
+        obs: Any = steps.observations
+        return Segments(
+            observations={key: first(part) for key, part in obs.items()} if isinstance(obs, dict) else first(obs),
+            actions=steps.actions.view(*shape, -1),
+            next_observations=steps.next_observations,
+            rewards=(self.reward_scale * steps.rewards[:, 0] + intrinsic[0]).view(shape),
+            ended=steps.dones.view(shape),
+            present=th.from_numpy(present.astype(np.float32)).to(self.device),
+        )
+
+    def _imagine(self, model: WorldModel, states: th.Tensor, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """
+        Follow the policy through the model.
+
+        :param model: The model, its weights constant
+        :param states: Latent states, [N, L]
+        :param latents: The latent variables, [N, Z]
+        :return: Lambda-returns [N] with the entropy and what is told about z, the actions' log probabilities [N * H], and
+            log q(z | s, a) - log p(z) with a gradient for q alone [N * H]
+        """
+        rewards, discounts, values, log_probabilities, ratios = [], [], [], [], []
+        for _ in range(self.horizon):
+            actions, log_probability = self.actor.sample_from(th.cat((states, latents), dim=1))
+            told = self.policy.inference.log_ratio(states, actions, latents)
+            ratios.append(self.policy.inference.log_ratio(states.detach(), actions.detach(), latents))
+            states, reward, end = model.step(states, actions)
+            rewards.append(reward - self.entropy_coef * log_probability + self.latent_coef * told)
+            discounts.append(self.gamma * th.sigmoid(-end))
+            values.append(model.values(states, latents).min(dim=0).values)
+            log_probabilities.append(log_probability)
+        returns = values[-1]
+        for reward, discount, value in zip(reversed(rewards), reversed(discounts), reversed(values), strict=True):
+            returns = reward + discount * ((1 - self.gae_lambda) * value + self.gae_lambda * returns)
+        return returns, th.cat(log_probabilities), th.cat(ratios)
+
+    def _update_model(self, segments: Segments, metrics: dict[str, list[th.Tensor]]) -> None:
+        policy, model = self.policy, self.policy.model
+        n, horizon = segments.rewards.shape
+        latents = policy.draw_latents(n)
+        with th.no_grad():
+            next_states = policy.encode(segments.next_observations, target=True)
+            returns = self._imagine(policy.model_target, next_states, latents.repeat_interleave(horizon, 0))[0]
+            returns = returns.clamp(self.v_min, self.v_max).view(n, horizon)
+            next_states = next_states.view(n, horizon, -1)
+        states = policy.encode(segments.observations)
+        errors: dict[str, list[th.Tensor]] = defaultdict(list)
+        for t in range(horizon):
+            states, rewards, ends = model.step(states, segments.actions[:, t])
+            goes_on = 1.0 - segments.ended[:, t]
+            errors["reward"].append((rewards - segments.rewards[:, t]).pow(2))
+            errors["end"].append(F.binary_cross_entropy_with_logits(ends, segments.ended[:, t], reduction="none"))
+            errors["state"].append((states - next_states[:, t]).pow(2).mean(dim=1))
+            errors["value"].append((model.values(states, latents) - returns[:, t]).pow(2).sum(dim=0) * goes_on)
+        means = {
+            name: (th.stack(parts, dim=1) * segments.present).sum() / segments.present.sum() for name, parts in errors.items()
+        }
+        factors = {"reward": self.reward_loss_coef, "state": self.state_loss_coef, "value": self.value_loss_coef, "end": 1.0}
+        loss = th.stack([factors[name] * mean for name, mean in means.items()]).sum()
+        policy.critics.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        th.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+        policy.critics.optimizer.step()
+        for name, mean in means.items():
+            metrics[f"{name}_loss"].append(mean.detach())
+
+    def _update_policy(self, segments: Segments, metrics: dict[str, list[th.Tensor]]) -> None:
+        """Actor, inference of z and the entropy's factor, by rollouts of the policy in the model."""
+        policy, model = self.policy, self.policy.model
+        with th.no_grad():
+            states = policy.encode(segments.observations)
+        model.requires_grad_(False)
+        returns, log_probabilities, ratios = self._imagine(model, states, policy.draw_latents(len(states)))
+        model.requires_grad_(True)
+        loss = -returns.mean() - ratios.mean()
+        self.actor.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        for part in (self.actor, policy.inference):
+            th.nn.utils.clip_grad_norm_(part.parameters(), self.max_grad_norm)
+        self.actor.optimizer.step()
+        target = -float(segments.actions.shape[-1]) if self.target_entropy is None else self.target_entropy
+        entropy_loss = -(policy.log_entropy_coef * (log_probabilities.detach() + target)).mean()
+        self.entropy_optimizer.zero_grad()
+        entropy_loss.backward()
+        self.entropy_optimizer.step()
+        metrics["actor_loss"].append(-returns.mean().detach())
+        metrics["latent_information"].append(ratios.mean().detach())
+        metrics["entropy_coef"].append(self.entropy_coef)
+
+    def _update_targets(self) -> None:
+        self._n_model_updates += 1
+        if self._n_model_updates % self.target_update_interval == 0:
+            online, target = self.policy.model, self.policy.model_target
+            get_ema_multi_avg_fn(1 - self.tau)(list(target.parameters()), list(online.parameters()), None)
+            for current, average in zip(online.buffers(), target.buffers(), strict=True):
+                average.copy_(current)
+
+    # ------------------------------------------------------------------ acting
+
+    def _begin_episodes(self) -> None:
+        self._episode_latents = self.policy.draw_latents(self.n_envs).cpu().numpy()
+
+    def _training_actions(self) -> np.ndarray:
+        return self.policy.predict(self._last_obs, latents=self._episode_latents)[0]  # type: ignore[arg-type]
+
+    def _store_transition(self, replay_buffer: Any, *args: Any, **kwargs: Any) -> None:
+        super()._store_transition(replay_buffer, *args, **kwargs)
+        ended = [env for env, _ in replay_buffer.just_finished]
+        self._episode_latents[ended] = self.policy.draw_latents(len(ended)).cpu().numpy()
+
+    # ------------------------------------------------------------------ saving
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names, variables = super()._get_torch_save_params()
+        return [*names, "entropy_optimizer"], variables
