@@ -29,6 +29,11 @@ from sb3_ddiffpg.visits import VisitMap
 
 SelfActorCritic = TypeVar("SelfActorCritic", bound="NoveltyActorCritic")
 
+# Where a normalised intrinsic reward is cut, in standard deviations
+LARGEST_INTRINSIC = 10.0
+# Metric: share of the first group's targets at the upper end of the support; and how much of it is a fault
+CUT_VALUES, MOST_CUT_VALUES = "values_at_limit", 0.02
+
 
 class NoveltyActorCritic(OffPolicyAlgorithm):
     """
@@ -81,6 +86,8 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
     policy: TwinCriticPolicy
     actor: Any
     replay_buffer: ModeReplayBuffer
+    # The argument that limits the values of the first group, which explores
+    _exploration_limit: ClassVar[str] = "v_max"
 
     def __init__(
         self,
@@ -173,7 +180,7 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
         self.visits: VisitMap | None = None
         self.env_spec: str | None = None
         self._resolved_features: Any = None
-        self._warned_support = False
+        self._warned_support = self._warned_cut_values = False
 
         if _init_setup_model:
             self._setup_model()
@@ -196,7 +203,7 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
         return {"mode_features": self._resolved_features, "success_key": self.success_key}
 
     def _check_arguments(self) -> None:
-        check_arguments(self, set(self._policy_arguments()))
+        check_arguments(self, self._policy_arguments)
 
     def _setup_model(self) -> None:
         self._check_arguments()
@@ -258,7 +265,7 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
             batch = self.replay_buffer.sample_modes(batch_size, self.gamma, self.n_steps, 1, env=self._vec_normalize_env)
             intrinsic = self._intrinsic_rewards(batch.windows[..., : self.n_steps], metrics)
             rewards = self.reward_scale * batch.rewards + intrinsic
-            metrics["critic_loss"].append(self._update_critics(batch, rewards))
+            self._update_critics(batch, rewards, metrics)
             self._update_actor(batch, metrics)
             self._update_targets()
         self._end_updates(gradient_steps, metrics)
@@ -270,8 +277,16 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
     def _end_updates(self, gradient_steps: int, metrics: dict[str, list[th.Tensor]]) -> None:
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in metrics.items():
-            self.logger.record(f"train/{name}", th.stack(values).mean().item())
+        means = {name: th.stack(values).mean().item() for name, values in metrics.items()}
+        for name, mean in means.items():
+            self.logger.record(f"train/{name}", mean)
+        if means.get(CUT_VALUES, 0.0) > MOST_CUT_VALUES and not self._warned_cut_values:
+            self._warned_cut_values = True
+            limit, value = self._exploration_limit, self.critics.upper[0].item()
+            warnings.warn(
+                f"{means[CUT_VALUES]:.0%} of the exploratory critics' targets are cut off at {limit}={value:g}, "
+                f"where one place is as good as another and exploration stops: raise {limit} or lower intrinsic_coef"
+            )
 
     def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
         """
@@ -307,7 +322,7 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
             self.intrinsic_moments.update(reward[:, None])
             # Not centred: where nothing is new, a negative reward would make it worth while to end the episode at a goal.
             # Limited: one surprising state would dominate the values for long
-            reward = (reward / (self.intrinsic_moments.var.sqrt() + 1e-8)).clamp(max=10.0)
+            reward = (reward / (self.intrinsic_moments.var.sqrt() + 1e-8)).clamp(max=LARGEST_INTRINSIC)
         if self.novelty_model.optimizer is not None:
             metrics["novelty_loss"].append(self.novelty_model.update(*inputs[1]))
         places = th.from_numpy(np.flatnonzero(present)).to(self.device, non_blocking=True)
@@ -324,7 +339,7 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
         with th.no_grad():
             return positions, self.actor.features(obs)
 
-    def _update_critics(self, batch: ModeBatch, rewards: th.Tensor) -> th.Tensor:
+    def _update_critics(self, batch: ModeBatch, rewards: th.Tensor, metrics: dict[str, list[th.Tensor]]) -> None:
         policy, shape = self.policy, batch.actions.shape
         with th.no_grad():
             next_actions, bonus = self._next_actions(batch)
@@ -340,7 +355,8 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
         (losses * batch.active).sum().backward()
         policy.critics.clip_gradients(self.max_grad_norm)
         policy.critics.optimizer.step()
-        return losses.detach().mean()
+        metrics["critic_loss"].append(losses.detach().mean())
+        metrics[CUT_VALUES].append(policy.critics.share_at_top(targets)[0])
 
     def _update_targets(self) -> None:
         policy = self.policy

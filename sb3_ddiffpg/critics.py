@@ -172,6 +172,17 @@ class ModeCritics(nn.Module):
             return errors.sum(dim=-1).mean(dim=2).sum(dim=1)
         return -(targets[:, None] * F.log_softmax(logits, dim=-1)).sum(dim=-1).mean(dim=2).sum(dim=1)
 
+    def share_at_top(self, targets: th.Tensor) -> th.Tensor:
+        """
+        How much of the targets lies at the upper end of the support, where larger values would look the same.
+
+        :param targets: From ``bellman_target``, shape [G, n, n_atoms]
+        :return: Share of every group, shape [G]
+        """
+        if self.n_atoms > 1:
+            return targets[..., -1].mean(dim=1)
+        return (targets[..., 0] >= self.upper[self._kind()][:, None]).float().mean(dim=1)
+
     def action_gradient(self, features: th.Tensor) -> Callable[[th.Tensor], th.Tensor]:
         """
         The gradient of min(Q1, Q2) with respect to each row's own action: it does not depend on the batch's size.

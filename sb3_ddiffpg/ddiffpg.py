@@ -16,7 +16,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_ddiffpg.actor_critic import NoveltyActorCritic
+from sb3_ddiffpg.actor_critic import LARGEST_INTRINSIC, NoveltyActorCritic
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, Behavior
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.callbacks import ClusteringCallback, contains_clustering
@@ -69,7 +69,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         ``"elementwise"``: from the minimum of their distributions, atom by atom, as in the authors' code
     :param v_min: Lower end of the values' support
     :param v_max: Upper end of the support of the modes' critics
-    :param exploration_v_max: Upper end of the support of the exploratory critics (the lower end is 0)
+    :param exploration_v_max: Upper end of the support of the exploratory critics (the lower end is 0); None: what novelty can
+        be worth at most, ``10 * intrinsic_coef / (1 - gamma)``, or ``v_max`` if that is more
     :param reward_scale: Factor on the environment's reward
     :param mode_n_steps: Length of the multi-step returns of the modes' critics (uncorrected)
     :param exploration_n_steps: The same for the exploratory critics
@@ -133,6 +134,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     policy: DiffusionPolicy
     actor: DiffusionActor
     replay_buffer: ModeReplayBuffer
+    _exploration_limit = "exploration_v_max"
 
     def __init__(
         self,
@@ -161,7 +163,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         twin_target: str = "lower_mean",
         v_min: float = 0.0,
         v_max: float = 5.0,
-        exploration_v_max: float = 10.0,
+        exploration_v_max: float | None = None,
         reward_scale: float = 1.0,
         mode_n_steps: int = 5,
         exploration_n_steps: int = 1,
@@ -294,8 +296,13 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             "n_modes": len(self._modes),
             "n_diffusion_steps": self.n_diffusion_steps,
             "mode_embedding_dim": self.mode_embedding_dim,
-            "exploration_support": (0.0, self.exploration_v_max),
+            "exploration_support": (0.0, self._exploration_v_max()),
         }
+
+    def _exploration_v_max(self) -> float:
+        if self.exploration_v_max is not None:
+            return self.exploration_v_max
+        return max(self.v_max, LARGEST_INTRINSIC * self.intrinsic_coef / max(1 - self.gamma, 1e-4))
 
     def _buffer_arguments(self) -> dict[str, Any]:
         return {
@@ -338,7 +345,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             )
             rewards = self._rewards(batch, metrics)
             # Update each critic with the Bellman equation on its own batch
-            metrics["critic_loss"].append(self._update_critics(batch, rewards))
+            self._update_critics(batch, rewards, metrics)
             # Gradient ascent on the target actions, which return to the buffer
             target_actions = self._improve_target_actions(batch)
             metrics["target_action_shift"].append((target_actions - batch.target_actions).abs().mean())

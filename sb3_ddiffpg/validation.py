@@ -52,9 +52,14 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     ),
     (("max_grad_norm",), "be positive", lambda value: _is_number(value) and value > 0),
     (
-        ("action_lr", "reward_scale", "exploration_v_max"),
+        ("action_lr", "reward_scale"),
         "be positive and finite",
         lambda value: _is_number(value) and 0 < value < np.inf,
+    ),
+    (
+        ("exploration_v_max",),
+        "be positive and finite, or None",
+        lambda value: value is None or (_is_number(value) and 0 < value < np.inf),
     ),
     (
         ("target_policy_noise", "target_noise_clip", "novelty_scale", "intrinsic_coef", "mode_intrinsic_coef", "new_way_coef"),
@@ -88,10 +93,10 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
 )
 
 
-def check_arguments(model: Any, set_by_constructor: set[str]) -> None:
+def check_arguments(model: Any, policy_arguments: Callable[[], dict[str, Any]]) -> None:
     """
     :param model: An algorithm whose arguments are set
-    :param set_by_constructor: Arguments of its policy that follow from its own
+    :param policy_arguments: Gives the arguments of its policy that follow from its own, where these are right
     :raises ValueError: For the first argument that cannot work
     """
     for names, accepted, is_right in RANGES:
@@ -104,7 +109,7 @@ def check_arguments(model: Any, set_by_constructor: set[str]) -> None:
     if given is not None and not (isinstance(given, type) and issubclass(given, ModeReplayBuffer)):
         name = getattr(given, "__name__", repr(given))
         raise ValueError(f"replay_buffer_class must be ModeReplayBuffer or a subclass of it, got {name}")
-    overridden = {name for name in set_by_constructor if name in model.policy_kwargs}
+    overridden = {name for name in policy_arguments() if name in model.policy_kwargs}
     if overridden:
         raise ValueError(f"policy_kwargs must not hold {sorted(overridden)}: {type(model).__name__}'s own arguments say these")
     if not model.v_min < model.v_max:

@@ -1,6 +1,7 @@
 """Rows in the main memory and on an accelerator hold the same; an update on the latter never waits for it."""
 
 import warnings
+from collections import defaultdict
 from functools import partial
 
 import numpy as np
@@ -142,7 +143,7 @@ def test_an_update_never_waits_for_the_device(settings, stored_on_device, monkey
 
     monkeypatch.setattr("sb3_ddiffpg.critics.LARGE_ASCENT", 10**9)
     model.replay_buffer.storage_device = th.device("cuda")  # only asked whether target actions must come back
-    metrics = {name: [] for name in ("intrinsic_reward", "novelty_loss")}
+    metrics = defaultdict(list)
     if "mode_intrinsic_coef" in settings:
         model.replay_buffer.expect_modes(len(model.modes))  # modes without transitions
     for method in ("cpu", "numpy", "item", "tolist", "__bool__", "__float__", "__int__"):
@@ -152,7 +153,7 @@ def test_an_update_never_waits_for_the_device(settings, stored_on_device, monkey
     with NoWaiting():
         batch = model.replay_buffer.sample_modes(48, model.gamma, 3, 5)
         rewards = model._rewards(batch, metrics)
-        model._update_critics(batch, rewards)
+        model._update_critics(batch, rewards, metrics)
         improved = model._improve_target_actions(batch)
         model._update_policy(batch, improved)
         model._update_targets()

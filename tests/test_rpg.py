@@ -1,5 +1,6 @@
 """RPG: its parts against formulas, and what it is for: several solutions at once."""
 
+from collections import defaultdict
 from itertools import pairwise
 
 import gymnasium as gym
@@ -13,8 +14,6 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg.baselines import RPG
-from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.evaluation import evaluate_modes
 
 
 def small(env=None, **changes):
@@ -101,8 +100,7 @@ def test_updates_move_their_own_parts():
             if any(not th.equal(old, new) for old, new in zip(before[name], part.parameters(), strict=True))
         }
 
-    metrics = {name: [] for name in ("actor_loss", "latent_information", "entropy_coef", "intrinsic_reward")}
-    metrics |= {f"{name}_loss": [] for name in ("reward", "end", "state", "value")}
+    metrics = defaultdict(list)
     segments = model._sample_segments(16, metrics)
     assert changed(lambda: model._update_model(segments, metrics)) == {"model"}
     assert changed(lambda: model._update_policy(segments, metrics)) == {"actor", "told"}
@@ -115,7 +113,7 @@ def test_updates_move_their_own_parts():
 def test_segments_are_consecutive_steps_of_one_episode():
     model = small(horizon=3, reward_scale=2.0, intrinsic_coef=0.0)
     model.learn(200)
-    buffer, metrics = model.replay_buffer, {"intrinsic_reward": []}
+    buffer, metrics = model.replay_buffer, defaultdict(list)
     segments = model._sample_segments(64, metrics)
     starts = {tuple(obs): row for row, obs in enumerate(buffer.observations[: buffer.size()].round(6).tolist())}
     ends_seen = 0

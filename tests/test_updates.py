@@ -1,5 +1,6 @@
 """One update of the algorithm: who learns from what."""
 
+import warnings
 from collections import defaultdict
 from copy import deepcopy
 
@@ -10,6 +11,8 @@ from environments import TwoEnds, small_model
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.baselines import TD3C51
+from sb3_ddiffpg.critics import ModeCritics
 
 # Plain steps: what is not trained stays exactly as it is
 PLAIN = {"net_arch": [16], "optimizer_class": th.optim.SGD}
@@ -68,7 +71,7 @@ def test_each_critic_learns_from_its_own_part_of_the_batch():
     for each in (batch, scrambled(batch, 1)):
         model.set_parameters(start)
         th.manual_seed(0)
-        model._update_critics(each, each.rewards)
+        model._update_critics(each, each.rewards, defaultdict(list))
         updated.append(parameters_of(model.critics))
     for name, first, second in zip(start["policy"], *updated, strict=False):
         assert th.equal(first[[0, 2]], second[[0, 2]]), name
@@ -87,7 +90,7 @@ def test_groups_without_data_train_nothing(tmp_path):
     for each in (batch, scrambled(scrambled(batch, 1), 2)):
         model.set_parameters(start)
         th.manual_seed(0)
-        model._update_critics(each, each.rewards)
+        model._update_critics(each, each.rewards, defaultdict(list))
         improved = model._improve_target_actions(each)
         model._update_policy(each, improved)
         updated.append((parameters_of(model.critics), parameters_of(model.actor)))
@@ -166,7 +169,7 @@ def test_the_backup_follows_the_mode(backup_embedding):
         seen.append((arguments[0].clone(), keywords["embeddings"].clone()))
 
     hook = model.actor.register_forward_pre_hook(watch, with_kwargs=True)
-    model._update_critics(batch, batch.rewards)
+    model._update_critics(batch, batch.rewards, defaultdict(list))
     hook.remove()
     ((observations, embeddings),) = seen
     assert th.equal(observations, batch.next_observations)
@@ -190,7 +193,7 @@ def test_target_policy_smoothing(monkeypatch):
 
     monkeypatch.setattr(model.policy.critics_target, "bellman_target", bellman_target)
     with pytest.raises(StopIteration):
-        model._update_critics(batch, batch.rewards)
+        model._update_critics(batch, batch.rewards, defaultdict(list))
     assert noise[0].abs().max().item() == pytest.approx(0.2)
     # Of N(0, .8) four fifths lie beyond .2, in equal parts on both sides
     assert (noise[0].abs() > 0.199).float().mean().item() == pytest.approx(0.80, abs=0.03)
@@ -229,3 +232,31 @@ def test_metrics_of_an_update():
     before = model._n_updates
     model.train(3, 60)
     assert model._n_updates == before + 3
+
+
+@pytest.mark.parametrize("n_atoms", [1, 51])
+def test_values_that_the_support_cuts_off_are_told(n_atoms):
+    """An explorer whose values all lie at the limit does not know where to go; nothing else shows it."""
+    env = DummyVecEnv([TwoEnds] * 4)
+    settings = {"n_atoms": n_atoms, "intrinsic_coef": 1.0, "learning_rate": 1e-2}
+    model = small_model(env, exploration_v_max=0.5, **settings)
+    with pytest.warns(
+        UserWarning, match=r"% of the exploratory critics' targets are cut off at exploration_v_max=0.5"
+    ) as told:
+        model.learn(300)
+    assert sum("cut off" in str(each.message) for each in told) == 1  # once
+    model = small_model(env, exploration_v_max=1000.0, **settings)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        model.learn(300)
+    model = TD3C51("MlpPolicy", env, v_max=0.5, learning_starts=40, batch_size=32, seed=0, **settings)
+    with pytest.warns(UserWarning, match="are cut off at v_max=0.5"):
+        model.learn(300)
+
+
+def test_the_share_of_cut_values():
+    critics = ModeCritics(3, 2, [8], n_groups=2, n_atoms=1, support=(0.0, 5.0), exploration_support=(0.0, 9.0))
+    targets = th.tensor([[[9.0], [8.9], [5.0], [0.0]], [[5.0], [4.9], [5.0], [0.0]]])
+    assert critics.share_at_top(targets).tolist() == [0.25, 0.5]
+    critics = ModeCritics(3, 2, [8], n_groups=1, n_atoms=3)
+    assert critics.share_at_top(th.tensor([[[0.2, 0.2, 0.6], [0.5, 0.5, 0.0]]])).item() == pytest.approx(0.3)

@@ -20,7 +20,7 @@ from torch import nn
 from torch.nn import functional as F
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from sb3_ddiffpg.actor_critic import NoveltyActorCritic
+from sb3_ddiffpg.actor_critic import CUT_VALUES, NoveltyActorCritic
 from sb3_ddiffpg.baselines.baseline import FifoReplayBuffer, names_of
 from sb3_ddiffpg.baselines.sac_c51 import GaussianActor
 from sb3_ddiffpg.baselines.world_model import WorldModel
@@ -443,6 +443,7 @@ class RPG(NoveltyActorCritic):
         with th.no_grad():
             next_states = policy.encode(segments.next_observations, target=True)
             returns = self._imagine(policy.model_target, next_states, latents.repeat_interleave(horizon, 0))[0]
+            metrics[CUT_VALUES].append((returns >= self.v_max).float().mean())
             returns = returns.clamp(self.v_min, self.v_max).view(n, horizon)
             next_states = next_states.view(n, horizon, -1)
         states = policy.encode(segments.observations)
