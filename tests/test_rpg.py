@@ -31,7 +31,7 @@ def imagined(model, states, latents):
 
 def test_returns_are_the_mean_of_all_lengths():
     """(1 - lambda) * sum of lambda^(n-1) G_n, the last with all the weight that is left (Sutton and Barto, chapter 12)."""
-    model = small(horizon=4, gae_lambda=0.7, gamma=0.9, latent_coef=0.3, initial_entropy_coef=0.2)
+    model = small(n_steps=4, gae_lambda=0.7, gamma=0.9, latent_coef=0.3, initial_entropy_coef=0.2)
     states, latents = th.rand(5, 8) - 0.5, th.randn(5, 3)
     returns, log_probabilities, _ = imagined(model, states, latents)
     th.manual_seed(3)
@@ -69,7 +69,7 @@ def test_what_is_told_about_the_latent_variable():
 
 def test_the_policys_gradient_goes_through_the_model():
     """Against finite differences, with the noise held fixed."""
-    model = small(horizon=3, latent_coef=0.1)
+    model = small(n_steps=3, latent_coef=0.1)
     model.policy.double()
     states, latents = th.rand(4, 8, dtype=th.float64) - 0.5, th.randn(4, 3, dtype=th.float64)
     weight = model.actor.latent[0].weight
@@ -111,7 +111,7 @@ def test_updates_move_their_own_parts():
 
 
 def test_segments_are_consecutive_steps_of_one_episode():
-    model = small(horizon=3, reward_scale=2.0, intrinsic_coef=0.0)
+    model = small(n_steps=3, reward_scale=2.0, intrinsic_coef=0.0)
     model.learn(200)
     buffer, metrics = model.replay_buffer, defaultdict(list)
     segments = model._sample_segments(64, metrics)

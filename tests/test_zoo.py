@@ -242,18 +242,21 @@ def test_learning_rates_as_text():
             parse({key: value})
 
 
-@pytest.mark.parametrize("name", ["ddiffpg", "ddiffpg-cpu", *BASELINES])
-def test_our_configuration(name):
+FILES = [("ddiffpg", "ddiffpg"), ("ddiffpg-cpu", "ddiffpg"), *((algo, algo) for algo in BASELINES)]
+
+
+@pytest.mark.parametrize(("name", "algo"), [*FILES, *(("baselines-cpu", algo) for algo in BASELINES)])
+def test_our_configuration(name, algo):
     zoo.register()
     entries = yaml.safe_load(zoo.config_file(name).read_text())
     gym.register_envs(gymnasium_robotics)
     for env_id, entry in entries.items():
-        check_hyperparameters("ddiffpg" if name == "ddiffpg-cpu" else name, list(entry))
+        check_hyperparameters(algo, list(entry))
         assert {"policy", "n_timesteps"} <= set(entry), env_id
         assert env_id in ("paper", "default") or env_id in gym.registry
     ours = {env_id for env_id in gym.registry if str(gym.spec(env_id).entry_point).startswith("sb3_ddiffpg.")}
     assert len(ours) == 14
-    assert {env_id for env_id in ours if name != "ddiffpg-cpu" or not env_id.startswith("Point")} <= set(entries)
+    assert {env_id for env_id in ours if not name.endswith("-cpu") or not env_id.startswith("Point")} <= set(entries)
     assert zoo.config_file("td3") is None
 
 

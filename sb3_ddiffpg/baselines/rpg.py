@@ -296,7 +296,7 @@ class RPG(NoveltyActorCritic):
 
     :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
-    :param horizon: Steps H of rollouts in the model, and of the segments from which it learns
+    :param n_steps: Steps H of rollouts in the model, and of the segments from which it learns
     :param gae_lambda: Weight lambda of longer returns
     :param latent_dim: Size of the latent variable
     :param latent_coef: Factor of log q(z | s, a) - log p(z) in the reward
@@ -309,7 +309,7 @@ class RPG(NoveltyActorCritic):
     :param target_entropy: Entropy that it aims at; None: minus the action's size
     :param tau: As in ``NoveltyActorCritic``
     :param n_atoms: Values are scalar: only 1
-    :param kwargs: Of ``NoveltyActorCritic``
+    :param kwargs: Of ``NoveltyActorCritic``; there is no Bellman target, so what is said of one has no effect
     :raises ValueError: If an argument is out of its range, naming it
     """
 
@@ -322,7 +322,7 @@ class RPG(NoveltyActorCritic):
         policy: str | type[BasePolicy],
         env: Any,
         *,
-        horizon: int = 3,
+        n_steps: int = 3,
         gae_lambda: float = 0.97,
         latent_dim: int = 12,
         latent_coef: float = 0.005,
@@ -339,7 +339,6 @@ class RPG(NoveltyActorCritic):
     ) -> None:
         if n_atoms != 1:
             raise ValueError(f"n_atoms must be 1, RPG's values are scalar, got {n_atoms!r}")
-        self.horizon = horizon
         self.gae_lambda = gae_lambda
         self.latent_dim = latent_dim
         self.latent_coef = latent_coef
@@ -352,7 +351,7 @@ class RPG(NoveltyActorCritic):
         self.target_entropy = target_entropy
         self._n_model_updates = 0
         self._episode_latents = np.empty((0, latent_dim), dtype=np.float32)
-        super().__init__(policy, env, tau=tau, n_atoms=n_atoms, **kwargs)
+        super().__init__(policy, env, n_steps=n_steps, tau=tau, n_atoms=n_atoms, **kwargs)
 
     # ------------------------------------------------------------------ set-up
 
@@ -391,7 +390,7 @@ class RPG(NoveltyActorCritic):
 
     def _sample_segments(self, batch_size: int, metrics: dict[str, list[th.Tensor]]) -> Segments:
         buffer, env = self.replay_buffer, self._vec_normalize_env
-        windows = buffer.sample_modes(batch_size, self.gamma, self.horizon, 1, env=env).windows[0]  # [B, H]
+        windows = buffer.sample_modes(batch_size, self.gamma, self.n_steps, 1, env=env).windows[0]  # [B, H]
         present = windows >= 0
         rows = np.where(present, windows, windows[:, :1]).ravel()
         steps = buffer.read(rows, env)
@@ -422,7 +421,7 @@ class RPG(NoveltyActorCritic):
             log q(z | s, a) - log p(z) with a gradient for q alone [N * H]
         """
         rewards, discounts, values, log_probabilities, ratios = [], [], [], [], []
-        for _ in range(self.horizon):
+        for _ in range(self.n_steps):
             actions, log_probability = self.actor.sample_from(th.cat((states, latents), dim=1))
             told = self.policy.inference.log_ratio(states, actions, latents)
             ratios.append(self.policy.inference.log_ratio(states.detach(), actions.detach(), latents))
