@@ -78,7 +78,9 @@ def automatic_labels(distances: np.ndarray, linkage: str = "average", max_modes:
     about 2.2 times as far from its members as they from one another; members of the other groups are outliers. Cuts that leave
     fewer than two modes, or half of the trajectories outside of them, are dismissed, and the cut of largest mean
     silhouette, outliers counting zero, is taken. The same question is then put to each of its modes, so that two goals
-    far apart do not hide the routes to each of them. If no cut is left, all trajectories are one mode.
+    far apart do not hide the routes to each of them. If no cut is left, all trajectories are one mode, but for those few that
+    join it last and from so far away that its silhouette beside them is as clear: the first of a rarer way, which would
+    otherwise be taken for its members and be forgotten among them.
 
     :param distances: as in :func:`cluster`
     :param linkage: as in :func:`cluster`
@@ -99,7 +101,7 @@ def automatic_labels(distances: np.ndarray, linkage: str = "average", max_modes:
         if len(parts):
             undecided.extend(parts)
         else:
-            modes.append(node)
+            modes.append(_without_strays(tree, node, min_size))
     return _numbered(tree.groups(modes, max_modes), n)
 
 
@@ -252,6 +254,11 @@ class _MergeTree:
         both_large = (self.size[self.children] >= min_size).all(axis=1)
         return np.unique(self.height[n:][both_large & self._below(node)[n:]])[::-1]
 
+    def children_of(self, node: int) -> np.ndarray:
+        """The two nodes that were merged to this one, none for a single trajectory."""
+        n = len(self.order)
+        return self.children[node - n] if node >= n else np.zeros(0, dtype=np.int64)
+
     def cut(self, node: int, height: float, min_size: int) -> np.ndarray:
         """The groups of at least ``min_size`` that ``node`` falls into when everything from ``height`` on is undone."""
         top = (self.height < height) & (self.parent_height >= height) & (self.size >= min_size)
@@ -305,6 +312,20 @@ def _clearest_cut(tree: _MergeTree, node: int, min_size: int) -> np.ndarray:
         if score > best_score:
             best, best_score = parts, score
     return best
+
+
+def _without_strays(tree: _MergeTree, node: int, min_size: int) -> int:
+    """The node within a mode that is left when groups too small for a mode, and clearly apart from it, are taken off."""
+    while True:
+        children = tree.children_of(node)
+        sizes = tree.size[children]
+        if not len(children) or (sizes >= min_size).sum() != 1:
+            return node
+        core, stray = children[sizes.argsort()[::-1]]
+        # A few alone could look as clear by chance: the core must be many
+        if tree.size[core] < 4 * tree.size[stray] or tree.silhouettes(np.array([core, stray]))[0] < _CLEAR_SILHOUETTE:
+            return node
+        node = int(core)
 
 
 def _numbered(groups: list[np.ndarray], n: int) -> np.ndarray:

@@ -259,6 +259,18 @@ def test_the_automatic_rule_does_not_stand_on_an_edge(silhouette, deviation, mon
             assert same_partition(cluster(distances, None, min_size=5), truth)
 
 
+@pytest.mark.parametrize("deviation", [0.2, 0.5])
+@pytest.mark.parametrize("counts", [[60, 1], [60, 4], [20, 3], [8, 1]])
+def test_the_first_of_a_rarer_way_are_not_taken_for_the_other(counts, deviation):
+    """Too few for a mode, they wait outside: as members they would be forgotten among the many before there are enough."""
+    for seed in range(6):
+        for routes in (ONE_BLOCK, TWO_GOALS):
+            paths, truth = runs(np.random.default_rng(seed), routes, counts, deviation)
+            labels = cluster(dtw_distances([resample_path(path, 48) for path in paths]), None, min_size=5)
+            often = truth == np.bincount(truth).argmax()
+            assert (labels[~often] == -1).all() and (labels[often] == 0).mean() > 0.95
+
+
 def test_wanderers_are_neither_a_mode_nor_in_the_way():
     for seed in range(3):
         rng = np.random.default_rng(seed)
