@@ -1,7 +1,10 @@
 """What all actor-critic algorithms of this package share: distributional twin critics, novelty, and the loop around them."""
 
+import io
+import pathlib
 import warnings
 from collections import defaultdict
+from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -12,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
@@ -502,6 +506,33 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
         return rollout
 
     # ------------------------------------------------------------------ saving
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+        optimizers: bool = True,
+    ) -> None:
+        """
+        See SB3.
+
+        :param path: Path to the file
+        :param exclude: Attributes to leave out
+        :param include: Attributes to save though they are usually left out
+        :param optimizers: Whether what the optimisers have gathered is saved; without it the file is half as large, and
+            training that goes on from it begins with fresh ones
+        """
+        attributes = (recursive_getattr(self, name) for name in self._get_torch_save_params()[0])
+        left_out = [each for each in attributes if isinstance(each, th.optim.Optimizer) and not optimizers]
+        states = [optimizer.state for optimizer in left_out]
+        try:
+            for optimizer in left_out:
+                optimizer.state = defaultdict(dict)
+            super().save(path, exclude, include)
+        finally:
+            for optimizer, state in zip(left_out, states, strict=True):
+                optimizer.state = state
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor"]

@@ -26,6 +26,7 @@ import torch as th
 import yaml
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_ddiffpg.actor_critic import NoveltyActorCritic
 from sb3_ddiffpg.callbacks import EvaluateModesCallback
 from sb3_ddiffpg.envs import is_ours
 from sb3_ddiffpg.evaluation import evaluate_modes
@@ -160,8 +161,11 @@ def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: 
         statistics, env = path.with_name("vecnormalize.pkl"), test_env
         if isinstance(test_env, VecNormalize) and statistics.exists():  # beside the best model only
             env = VecNormalize.load(str(statistics), test_env.venv)
-        found = evaluate_modes(ALGOS[algo].load(path), env, N_EPISODES, seed=seed + 1_000)
+        tested = ALGOS[algo].load(path)
+        found = evaluate_modes(tested, env, N_EPISODES, seed=seed + 1_000)
         found.save(folder / ("evaluation.json" if name == "best" else "logs/evaluation_final.json"))
+        if name == "best" and isinstance(tested, NoveltyActorCritic):
+            tested.save(path, optimizers=False)
         print(f"\n{name} model\n{found}")
     test_env.close()
 
