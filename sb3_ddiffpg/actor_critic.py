@@ -331,6 +331,11 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
             metrics["novelty_loss"].append(self.novelty_model.update(*inputs[1]))
         places = th.from_numpy(np.flatnonzero(present)).to(self.device, non_blocking=True)
         rewards = reward.new_zeros(windows.size).index_copy(0, places, reward).view(windows.shape)
+        if self.normalize_intrinsic and len(windows) > 1:
+            # For a mode an ordinary place is worth nothing: staying there for ever would be worth as much as a distant goal
+            ordinary = (self.intrinsic_moments.mean / (self.intrinsic_moments.var.sqrt() + 1e-8)).clamp(max=LARGEST_INTRINSIC)
+            modes_present = th.from_numpy(present[1:]).to(self.device, non_blocking=True)
+            rewards[1:] -= ordinary * modes_present
         discounts = self.gamma ** th.arange(windows.shape[-1], device=self.device)
         return self.intrinsic_coef * (rewards * discounts).sum(dim=-1).float()
 

@@ -164,12 +164,19 @@ def test_normalised_observations(tmp_path, capsys):
     assert "Loading running average" in capsys.readouterr().out
 
 
-def test_optimise(tmp_path, capsys):
+@pytest.mark.parametrize("algo", ["ddiffpg", *BASELINES])
+def test_optimise(tmp_path, capsys, algo):
     storage = ["--storage", str(tmp_path / "study.log"), "--study-name", "one"]
     options = ["-optimize", "--n-trials", "1", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
-    train(tmp_path, *options, *storage, "--seed", "3", n_envs=2, learning_starts=140)
+    settings = {
+        name: value for name, value in SMALL.items() if algo == "ddiffpg" or name not in ("min_mode_size", "recluster_freq")
+    }
+    # All but the last few steps are random: the trial's own settings may be slow
+    settings |= {"n_envs": 2, "learning_starts": 140}
+    options += ["--hyperparams", *(f"{name}:{value!r}" for name, value in settings.items())]
+    main(["train", "--algo", algo, "--env", ENV, "-n", "150", "-f", str(tmp_path), "--seed", "3", *storage, *options])
     assert "Best trial:" in capsys.readouterr().out
-    assert list(tmp_path.glob("ddiffpg/report_*.csv"))
+    assert list(tmp_path.glob(f"{algo}/report_*.csv"))
 
 
 @pytest.mark.parametrize("algo", ["ddiffpg", *BASELINES])
