@@ -11,6 +11,7 @@ import csv
 import importlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -128,7 +129,7 @@ def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: 
         "env": env_id,
         "seed": seed,
         "hyperparams": hyperparams,
-        "command": " ".join([Path(sys.executable).name, *sys.argv]),
+        "command": shlex.join(["python", "-m", "sb3_ddiffpg.experiments.run", *sys.argv[1:]]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "git_commit": _git_commit(),
         "machine": _machine(),
