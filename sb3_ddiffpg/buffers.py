@@ -24,7 +24,8 @@ class ModeBatch(NamedTuple):
     Observations are [N, ...] (or dicts of such), ``actions``, ``target_actions`` [G, n, action_dim], ``rewards`` and
     ``discounts`` [G, n]. ``active`` [G] is False for a mode without any transition, whose rows are a stand-in that must
     not train it. ``imitated`` [G, n] is False for these and for steps of foreign trajectories, which the policy must not
-    learn. ``rows`` [G, n] and ``windows`` [G, n, n_steps] (-1 where a window ends early, or beyond the mode's route) say where
+    learn. ``new_ways`` [n] are the exploratory group's returns from goals reached by ways of which a mode has not its fill.
+    ``rows`` [G, n] and ``windows`` [G, n, n_steps] (-1 where a window ends early, or beyond the mode's route) say where
     in the buffer the transitions lie.
     """
 
@@ -36,6 +37,7 @@ class ModeBatch(NamedTuple):
     discounts: th.Tensor
     active: th.Tensor
     imitated: th.Tensor
+    new_ways: th.Tensor
     rows: np.ndarray
     windows: np.ndarray
 
@@ -43,7 +45,7 @@ class ModeBatch(NamedTuple):
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
     *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct", "loop_share", "route_share"),
-    "explore_beyond_goals",
+    *("new_way_share", "explore_beyond_goals"),
 )
 
 
@@ -72,6 +74,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         about the mean distance along the way; False for the root of the summed squares, to which the paper's thresholds refer
     :param loop_share: Radius within which a path that comes back has made a loop, as a share of the path's extent
     :param route_share: Distance beyond which a step is off a mode's route, as a share of the route's extent
+    :param new_way_share: Share of the exploratory group's rows that are drawn from trajectories which reached a goal by a way
+        of which a mode has not its fill
     :param explore_beyond_goals: Whether a goal does not end the exploratory group's returns
     :raises ValueError: If a size is not positive or ``optimize_memory_usage`` is asked for
     """
@@ -80,6 +84,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     exploratory_target_actions: Any
     foreign: np.ndarray
     off_route: np.ndarray
+    way_novelty: np.ndarray
     goals: np.ndarray
 
     def __init__(
@@ -102,6 +107,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         normalize_distances: bool = True,
         loop_share: float = 0.05,
         route_share: float = 0.1,
+        new_way_share: float = 0.0,
         explore_beyond_goals: bool = False,
     ) -> None:
         for name, value, least in (
@@ -112,6 +118,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             ("n_path_points", n_path_points, 2),
             ("loop_share", loop_share, 0),
             ("route_share", route_share, 0),
+            ("new_way_share", new_way_share, 0),
         ):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
@@ -124,6 +131,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.normalize_distances = normalize_distances
         self.loop_share = loop_share
         self.route_share = route_share
+        self.new_way_share = new_way_share
         self.explore_beyond_goals = explore_beyond_goals
         super().__init__(
             buffer_size,
@@ -148,17 +156,18 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self._mode_position = np.empty(0, dtype=np.int32)
         self._last_positions = np.empty((0, self.features.dim), dtype=np.float32)
         self.mode_rows: list[RowSet] = []
+        self._new_way_rows = np.empty(0, dtype=np.int32)
 
     def _step_fields(self) -> Fields:
         action = ((self.action_dim,), np.float32)
         return {**super()._step_fields(), "target_actions": action, "exploratory_target_actions": action}
 
     def _note_fields(self) -> Fields:
-        own = {"foreign": ((), bool), "off_route": ((), bool), "goals": ((), bool)}
+        own = {"foreign": ((), bool), "off_route": ((), bool), "way_novelty": ((), np.float32), "goals": ((), bool)}
         return {**super()._note_fields(), **own}
 
     def _view_names(self) -> list[str]:
-        own = ["target_actions", "exploratory_target_actions", "foreign", "off_route", "goals"]
+        own = ["target_actions", "exploratory_target_actions", "foreign", "off_route", "way_novelty", "goals"]
         return [*super()._view_names(), *own]
 
     def _position_arrays(self) -> list[np.ndarray]:
@@ -168,7 +177,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         super()._allocate()
         self.target_actions = self._steps["target_actions"]
         self.exploratory_target_actions = self._steps["exploratory_target_actions"]
-        self.foreign, self.off_route, self.goals = (self._notes[name] for name in ("foreign", "off_route", "goals"))
+        self.foreign, self.off_route = self._notes["foreign"], self._notes["off_route"]
+        self.way_novelty, self.goals = self._notes["way_novelty"], self._notes["goals"]
         self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
         for row_set in self.mode_rows:
             row_set.position = self._mode_position
@@ -178,6 +188,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         for name in ("target_actions", "exploratory_target_actions"):
             self._steps.write(name, rows, action)
         self.foreign[rows] = self.off_route[rows] = self.goals[rows] = False
+        self.way_novelty[rows] = 0.0
         self._last_positions = self.features(next_obs)
 
     def _finish(self, env: int, info: dict[str, Any]) -> Trajectory:
@@ -189,6 +200,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         trajectory = super()._evict()
         if trajectory.trains:
             self.mode_rows[trajectory.mode].remove(trajectory.rows)
+        if self.way_novelty[trajectory.rows[-1]] > 0:
+            self._new_way_rows = np.setdiff1d(self._new_way_rows, trajectory.rows)
         return trajectory
 
     # ------------------------------------------------------------------ modes
@@ -327,8 +340,11 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
                     trajectory.trains = True
                 kept = [*direct[-limit:], *detours[-limit:]]
                 dropped = [*direct[:-limit], *detours[:-limit]]
+                # How far the mode is from having its fill; what is in no mode is all new
+                novelty = 1.0 if mode == NO_MODE else 1.0 - min(len(direct) / limit, 1.0)
                 for trajectory in members:
                     self._change_mode(trajectory, mode, parents)
+                    self.way_novelty[trajectory.rows[-1]] = novelty * (trajectory.success and not trajectory.foreign)
                 stays += kept
                 goes += dropped
         for trajectory in sorted(stays, key=lambda t: t.serial):
@@ -337,7 +353,10 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
                 self.mode_rows[trajectory.mode].add(trajectory.rows)
         for trajectory in sorted(goes, key=lambda t: t.serial):
             trajectory.mode, trajectory.trains, trajectory.path = NO_MODE, False, None
+            self.way_novelty[trajectory.rows[-1]] = 0.0
             self._retired.append(trajectory)
+        new_ways = [trajectory.rows for trajectory in stays if self.way_novelty[trajectory.rows[-1]] > 0]
+        self._new_way_rows = np.concatenate([self._new_way_rows[:0], *new_ways])
 
     def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:
         """
@@ -407,6 +426,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         active = np.array([True, *(row_set.size > 0 for row_set in self.mode_rows)])
         sets = [self._all, *(row_set if row_set.size else self._all for row_set in self.mode_rows)]
         rows = np.stack([row_set.sample(n) for row_set in sets])  # [G, n]
+        if len(self._new_way_rows) and self.new_way_share:
+            n_new = round(self.new_way_share * n)
+            rows[EXPLORATORY_GROUP, :n_new] = np.random.choice(self._new_way_rows, n_new)
         windows, notes = self._windows(rows, exploration_n_steps, mode_n_steps)
         present = windows >= 0
         powers = np.float32(gamma) ** np.arange(windows.shape[-1], dtype=np.float32)
@@ -417,7 +439,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         # What led away from the route is for the critic to judge, not for the policy to follow
         imitated = active[:, None] & ~notes["foreign"][..., 0]
         imitated[EXPLORATORY_GROUP] = True
-        rewards = (np.where(present & ~lost, rewards, 0.0) * powers).sum(axis=-1)  # [G, n]
+        rewards = np.where(present & ~lost, rewards, 0.0) * powers
+        new_ways = (rewards[EXPLORATORY_GROUP] * notes["way_novelty"][EXPLORATORY_GROUP]).sum(axis=-1)  # [n]
+        rewards = rewards.sum(axis=-1)  # [G, n]
         lengths = present.sum(axis=-1)
         ends = lengths[..., None] - 1
         last = np.take_along_axis(windows, ends, axis=-1).ravel()
@@ -441,6 +465,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             discounts=self._to_device(discounts.astype(np.float32)),
             active=self._to_device(active),
             imitated=self._to_device(imitated),
+            new_ways=self._to_device(new_ways.astype(np.float32)),
             rows=rows,
             windows=np.where(lost, -1, windows),
         )

@@ -32,6 +32,10 @@ from sb3_ddiffpg.validation import check_mode_arguments
 SelfDDiffPG = TypeVar("SelfDDiffPG", bound="DDiffPG")
 
 
+# Of the exploratory group's batch, from trajectories that took a new way: among all transitions these are too few to be met
+NEW_WAY_SHARE = 0.25
+
+
 class DDiffPG(ModeControl, NoveltyActorCritic):
     """
     Deep Diffusion Policy Gradient (DDiffPG): learns several ways to solve one task.
@@ -104,6 +108,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param novelty_scale: The factor alpha of NovelD
     :param intrinsic_coef: Factor c on the intrinsic reward
     :param mode_intrinsic_coef: Factor on the intrinsic reward that is added to the modes' rewards
+    :param new_way_coef: Factor on the environment's reward that the exploratory critics get for goals reached by ways that are
+        in no mode, or in one that has not its fill of trajectories yet: a second way is worth finding where the first pays
     :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
@@ -187,6 +193,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         novelty_scale: float = 0.5,
         intrinsic_coef: float = 0.05,
         mode_intrinsic_coef: float = 0.0,
+        new_way_coef: float = 0.0,
         normalize_intrinsic: bool = True,
         reset_new_critics: bool = True,
         max_grad_norm: float = 1.0,
@@ -265,6 +272,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         self.explore_then_exploit = explore_then_exploit
         self.explore_beyond_goals = explore_beyond_goals
         self.mode_intrinsic_coef = mode_intrinsic_coef
+        self.new_way_coef = new_way_coef
         self.reset_new_critics = reset_new_critics
         self.control = control
 
@@ -302,6 +310,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             "max_successes_per_mode": self.max_successes_per_mode,
             "max_failures_per_mode": self.max_failures_per_mode,
             "explore_beyond_goals": self.explore_beyond_goals,
+            "new_way_share": NEW_WAY_SHARE if self.new_way_coef else 0.0,
         }
 
     def _check_arguments(self) -> None:
@@ -353,7 +362,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         rewards = self.reward_scale * batch.rewards
         if everywhere:
             rewards = rewards + self.mode_intrinsic_coef * intrinsic
-        rewards[EXPLORATORY_GROUP] = intrinsic[EXPLORATORY_GROUP]
+        rewards[EXPLORATORY_GROUP] = intrinsic[EXPLORATORY_GROUP] + self.new_way_coef * self.reward_scale * batch.new_ways
         return rewards
 
     def _row_embeddings(self, batch: ModeBatch, masked: bool) -> th.Tensor:

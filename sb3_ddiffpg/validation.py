@@ -62,7 +62,7 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
         lambda value: value is None or (_is_number(value) and 0 < value < np.inf),
     ),
     (
-        ("target_policy_noise", "target_noise_clip", "novelty_scale", "intrinsic_coef", "mode_intrinsic_coef"),
+        ("target_policy_noise", "target_noise_clip", "novelty_scale", "intrinsic_coef", "mode_intrinsic_coef", "new_way_coef"),
         "be a finite number of at least 0",
         lambda value: _is_number(value) and 0 <= value < np.inf,
     ),

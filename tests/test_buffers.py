@@ -417,6 +417,36 @@ def test_a_mode_remembers_its_detours_but_does_not_learn_from_them(lengths, deto
     )
 
 
+def test_goals_by_new_ways_are_worth_something_to_exploration():
+    """As much as their mode is short of trajectories; where no mode is, everything; what has retired or strayed, nothing."""
+    buffer = make_buffer(500, mode_features=[0, 1], max_successes_per_mode=4)
+    fill(buffer, [np.full((3, 2), k, dtype=np.float32) for k in range(9)], reward=2.0)
+    fill(buffer, [np.full((3, 2), 9, dtype=np.float32)], success=False, reward=2.0)
+    successes, failures = buffer.trajectories(True), buffer.trajectories(False)
+    strayed = successes.pop(0)
+    buffer.mark_off_route(strayed, successes[1:2])
+    labels = np.array([0, 0, 0, 0, 0, 1, 1, NO_MODE])  # of 4: more than full, half full, and one that is in no mode
+    buffer.assign_modes(successes, labels, [strayed, *failures], np.zeros(2), [None, None])
+    worth = dict(enumerate([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.5, 1.0, 0.0]))
+    batch = buffer.sample_modes(900, GAMMA, 2, 1)
+    obs = buffer.observations[batch.rows[0], 0]
+    ends = buffer.dones[batch.rows[0]]
+    follows = buffer.next_row[batch.rows[0]]
+    for k, value in enumerate(batch.new_ways.numpy()):
+        # Two steps of return: an episode's last reward counts from itself and from the step before
+        ahead = not ends[k] and buffer.dones[follows[k]]
+        expected = 2.0 * worth[int(obs[k])] * (1.0 if ends[k] else GAMMA if ahead else 0.0)
+        assert value == pytest.approx(expected), (obs[k], ends[k])
+    assert (batch.new_ways > 0).any()
+    buffer.new_way_share = 0.5
+    drawn = buffer.observations[buffer.sample_modes(900, GAMMA, 1, 1).rows[0], 0]
+    assert {6, 7, 8} == set(drawn[:150]) and set(drawn[150:]) == set(range(10))
+    buffer._evict()  # the first to go is a retired one, which none of them is
+    assert len(buffer._new_way_rows) == 6
+    buffer.add(*[np.full((1, 2), 7, np.float32)] * 2, np.zeros((1, 2)), np.zeros(1), np.zeros(1, bool), [{}])
+    assert buffer.way_novelty[buffer._running[0, 0]] == 0.0
+
+
 def test_a_mode_is_shown_a_foreign_trajectory_as_a_way_off_its_route():
     """Up to where it leaves the route it is as any other; from there on it is worth nothing, and the end."""
     buffer = make_buffer(500, mode_features=[0, 1])
