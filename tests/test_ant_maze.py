@@ -223,3 +223,26 @@ def test_interface_and_arguments():
             AntMazeEnv("V3", **arguments)
     with pytest.raises(ValueError, match=r"actions: shape \(8,\)"):
         env.step(np.zeros(8))
+
+
+def test_a_fall_ends_the_episode_if_asked_for():
+    """One ant upside down, one on its side, one upright; alone and many at once."""
+    turns = {"back": (0.0, 1.0, 0.0, 0.0), "side": (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0), "feet": (1.0, 0.0, 0.0, 0.0)}
+    for ends_on_fall in (False, True):
+        kwargs = {"integrator": "euler", "ends_on_fall": ends_on_fall}
+        many = AntMazeVecEnv(3, "V1", max_episode_steps=50, **kwargs)
+        many.seed(0)
+        many.reset()
+        many.simulation._state[:, 4:8] = list(turns.values())
+        _, rewards, dones, infos = many.step(np.zeros((3, 8), dtype=np.float32))
+        assert dones.tolist() == [ends_on_fall, False, False] and not rewards.any()
+        assert [info["is_success"] or info["TimeLimit.truncated"] for info in infos] == [False] * 3
+        assert ("terminal_observation" in infos[0]) == ends_on_fall
+        many.close()
+        for name, turn in turns.items():
+            env = AntMazeEnv("V1", **kwargs)
+            env.reset(seed=0)
+            env.simulation._state[0, 4:8] = turn
+            _, _, terminated, truncated, info = env.step(np.zeros(8, dtype=np.float32))
+            assert terminated == (ends_on_fall and name == "back") and not truncated and not info["is_success"]
+            env.close()

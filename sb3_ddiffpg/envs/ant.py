@@ -26,12 +26,16 @@ _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _N_QPOS, _N_QVEL = 15, 14
 
 
+# Upward component of a torso that lies upside down; on its side it is 0
+_ON_ITS_BACK = -0.5
+
+
 class AntSimulation(MazeSimulation):
     """
     n ants, each in a copy of one maze of its own, moved together by MuJoCo's thread pool.
 
     The body is D4RL's ant: gymnasium's with gear 30, time step 0.02 s and softer contacts. It begins with straight legs, at
-    rest, without noise; nothing ends when it falls over.
+    rest, without noise; nothing ends when it falls over, unless asked for.
 
     :param n: number of ants
     :param maze_map: name or map of a :class:`~sb3_ddiffpg.envs.mazes.Maze`
@@ -42,6 +46,8 @@ class AntSimulation(MazeSimulation):
     :param goal_radius: a goal is reached when the torso's centre is within this distance of its centre, in metres
     :param integrator: ``"rk4"``, as D4RL, or ``"euler"``, two to three times faster and close to it, but not the same
     :param n_blocked: gap cells that are walled in each episode, see :class:`MazeSimulation`
+    :param ends_on_fall: whether an episode ends, without success, when the ant lies on its back, from where it does not get
+        up: for training, which is spared the rest of it
     :param n_threads: threads that step the ants; None: one per processor this process may use, 0 for a single ant
     :raises ValueError: if an argument is out of its range or the start box overlaps a wall
     """
@@ -58,6 +64,7 @@ class AntSimulation(MazeSimulation):
         goal_radius: float = 0.5,
         integrator: str = "rk4",
         n_blocked: int = 0,
+        ends_on_fall: bool = False,
         n_threads: int | None = None,
     ) -> None:
         if integrator not in INTEGRATORS:
@@ -70,6 +77,7 @@ class AntSimulation(MazeSimulation):
             start_noise = (1.0, 2.0) if isinstance(maze_map, str) and maze_map == "V1" else 0.0
         super().__init__(n, maze_map, start_noise, goal_rewards, goal_radius, n_blocked)
         self.integrator = integrator
+        self.ends_on_fall = ends_on_fall
         self.n_threads = n_threads
         model = self._model(0)
         self._begin = np.zeros(mujoco.mj_stateSize(model, _STATE))
@@ -115,6 +123,14 @@ class AntSimulation(MazeSimulation):
         :return: (x, y) of every torso, shape (n, 2)
         """
         return self._state[:, 1:3]
+
+    def lost(self) -> npt.NDArray[np.bool_]:
+        """
+        :return: whether each ant lies on its back, if that ends an episode, shape (n,)
+        """
+        # The z component of the torso's own upward axis, from the quaternion's x and y behind time and position
+        upward = 1.0 - 2.0 * (self._state[:, 5:7] ** 2).sum(axis=1)
+        return self.ends_on_fall & (upward < _ON_ITS_BACK)
 
     def _place(self, indices: Sequence[int] | npt.NDArray[np.intp], positions: FloatArray) -> None:
         self._state[indices] = self._begin

@@ -86,7 +86,8 @@ class MazeEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         info: dict[str, Any] = {"is_success": goal_id >= 0, "goal_id": None, "mode": None}
         if goal_id >= 0:
             info.update(goal_id=goal_id, mode=self.simulation.label(0, goal_id))
-        return self.simulation.observations()[0], float(self.simulation.rewards[goal_id]), goal_id >= 0, False, info
+        terminated = goal_id >= 0 or bool(self.simulation.lost()[0])
+        return self.simulation.observations()[0], float(self.simulation.rewards[goal_id]), terminated, False, info
 
     def render(self) -> Image | None:
         """
@@ -175,7 +176,8 @@ class MazeVecEnv(VecEnv):
         """
         goal_ids = self.simulation.move(self._actions)
         self._steps += 1
-        dones = (goal_ids >= 0) | (self._steps >= self.max_episode_steps)
+        terminated = (goal_ids >= 0) | self.simulation.lost()
+        dones = terminated | (self._steps >= self.max_episode_steps)
         observations = self.simulation.observations()
         ongoing = {"is_success": False, "goal_id": None, "mode": None, "TimeLimit.truncated": False}
         infos: list[dict[str, Any]] = [ongoing.copy() for _ in range(self.num_envs)]
@@ -183,6 +185,7 @@ class MazeVecEnv(VecEnv):
         if done:
             for i in done:
                 self._close_episode(i, int(goal_ids[i]), infos[i])
+                infos[i]["TimeLimit.truncated"] = not terminated[i]
                 infos[i]["terminal_observation"] = observations[i].copy()
             self._begin(done, [{}] * len(done))
             observations = self.simulation.observations()
@@ -191,8 +194,6 @@ class MazeVecEnv(VecEnv):
     def _close_episode(self, i: int, goal_id: int, info: dict[str, Any]) -> None:
         if goal_id >= 0:
             info.update(is_success=True, goal_id=goal_id, mode=self.simulation.label(i, goal_id))
-        else:
-            info["TimeLimit.truncated"] = True
 
     def close(self) -> None:
         """Release what pictures needed."""

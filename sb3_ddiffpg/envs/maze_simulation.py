@@ -194,6 +194,12 @@ class MazeSimulation:
         reached = (offsets**2).sum(axis=0) <= self.goal_radius**2
         return np.where(reached.any(axis=0), reached.argmax(axis=0), -1)
 
+    def lost(self) -> npt.NDArray[np.bool_]:
+        """
+        :return: whether each body cannot go on, so that its episode ends, shape (n,)
+        """
+        return np.zeros(self.n, dtype=bool)
+
     def label(self, i: int, goal_id: int) -> str:
         """
         :param i: index of a body
