@@ -326,14 +326,15 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
             self.intrinsic_moments.update(reward[:, None])
             # Not centred: where nothing is new, a negative reward would make it worth while to end the episode at a goal.
             # Limited: one surprising state would dominate the values for long
-            reward = (reward / (self.intrinsic_moments.var.sqrt() + 1e-8)).clamp(max=LARGEST_INTRINSIC)
+            scale = self.intrinsic_moments.var.sqrt() + 1e-8
+            reward = (reward / scale).clamp(max=LARGEST_INTRINSIC)
         if self.novelty_model.optimizer is not None:
             metrics["novelty_loss"].append(self.novelty_model.update(*inputs[1]))
         places = th.from_numpy(np.flatnonzero(present)).to(self.device, non_blocking=True)
         rewards = reward.new_zeros(windows.size).index_copy(0, places, reward).view(windows.shape)
         if self.normalize_intrinsic and len(windows) > 1:
             # For a mode an ordinary place is worth nothing: staying there for ever would be worth as much as a distant goal
-            ordinary = (self.intrinsic_moments.mean / (self.intrinsic_moments.var.sqrt() + 1e-8)).clamp(max=LARGEST_INTRINSIC)
+            ordinary = (self.intrinsic_moments.mean / scale).clamp(max=LARGEST_INTRINSIC)
             modes_present = th.from_numpy(present[1:]).to(self.device, non_blocking=True)
             rewards[1:] -= ordinary * modes_present
         discounts = self.gamma ** th.arange(windows.shape[-1], device=self.device)

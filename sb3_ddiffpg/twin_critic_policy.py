@@ -14,6 +14,14 @@ from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.features import ScaledFlattenExtractor
 
 
+def default_extractor(observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
+    """
+    :param observation_space: Observation space
+    :return: What scales bounded observations, or combines those of a dict
+    """
+    return CombinedExtractor if isinstance(observation_space, spaces.Dict) else ScaledFlattenExtractor
+
+
 class Actor(BasePolicy):
     """
     What all actors have in common.
@@ -103,13 +111,10 @@ class TwinCriticPolicy(BasePolicy):
         exploration_support: tuple[float, float] = (0.0, 5.0),
         twin_target: str = "lower_mean",
     ) -> None:
-        if features_extractor_class is None:
-            is_dict = isinstance(observation_space, spaces.Dict)
-            features_extractor_class = CombinedExtractor if is_dict else ScaledFlattenExtractor
         super().__init__(
             observation_space,
             action_space,
-            features_extractor_class,
+            features_extractor_class or default_extractor(observation_space),
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,

@@ -1,14 +1,12 @@
-"""RPG: its parts against formulas, and what it is for: several solutions at once."""
+"""RPG: its parts against formulas."""
 
 from collections import defaultdict
 from itertools import pairwise
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from environments import TwoEnds
-from gymnasium import spaces
 from scipy.stats import norm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -55,11 +53,7 @@ def test_returns_are_the_mean_of_all_lengths():
 
 def test_what_is_told_about_the_latent_variable():
     model = small()
-    states, actions, latents = (
-        th.rand(6, 8),
-        th.rand(6, 1) if model.action_space.shape == (1,) else th.rand(6, 2),
-        th.randn(6, 3),
-    )
+    states, actions, latents = th.rand(6, 8), th.rand(6, 1), th.randn(6, 3)
     output = model.policy.inference.net(th.cat((states, actions), dim=1)).detach().numpy()
     posterior = norm(output[:, :3], np.exp(output[:, 3:]))
     expected = (posterior.logpdf(latents.numpy()) - norm.logpdf(latents.numpy())).sum(axis=1)
@@ -159,18 +153,3 @@ def test_an_episode_keeps_its_latent_variable():
 def test_values_are_scalar():
     with pytest.raises(ValueError, match="n_atoms must be 1"):
         small(n_atoms=51)
-
-
-class TwoArms(gym.Env):
-    """One step; what is paid falls off around two actions."""
-
-    observation_space = spaces.Box(-1.0, 1.0, (1,))
-    action_space = spaces.Box(-1.0, 1.0, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1, dtype=np.float32), {}
-
-    def step(self, action):
-        reward = max(np.exp(-(((action[0] - arm) / 0.15) ** 2)) for arm in (-0.6, 0.6))
-        return np.zeros(1, dtype=np.float32), float(reward), True, False, {}

@@ -11,7 +11,6 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
-    CombinedExtractor,
     create_mlp,
     get_actor_critic_arch,
 )
@@ -24,7 +23,7 @@ from sb3_ddiffpg.actor_critic import CUT_VALUES, NoveltyActorCritic
 from sb3_ddiffpg.baselines.baseline import FifoReplayBuffer, names_of
 from sb3_ddiffpg.baselines.sac_c51 import GaussianActor
 from sb3_ddiffpg.baselines.world_model import WorldModel
-from sb3_ddiffpg.features import ScaledFlattenExtractor
+from sb3_ddiffpg.twin_critic_policy import default_extractor
 
 
 class LatentActor(GaussianActor):
@@ -119,13 +118,10 @@ class RPGPolicy(BasePolicy):
         n_critics: int = 2,
         support: tuple[float, float] = (0.0, 5.0),
     ) -> None:
-        if features_extractor_class is None:
-            is_dict = isinstance(observation_space, spaces.Dict)
-            features_extractor_class = CombinedExtractor if is_dict else ScaledFlattenExtractor
         super().__init__(
             observation_space,
             action_space,
-            features_extractor_class,
+            features_extractor_class or default_extractor(observation_space),
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
@@ -395,7 +391,7 @@ class RPG(NoveltyActorCritic):
         rows = np.where(present, windows, windows[:, :1]).ravel()
         steps = buffer.read(rows, env)
         shape = windows.shape
-        intrinsic = self._intrinsic_rewards(np.where(present, windows, -1).reshape(1, -1, 1), metrics)
+        intrinsic = self._intrinsic_rewards(windows.reshape(1, -1, 1), metrics)
 
         def first(part: th.Tensor) -> th.Tensor:
             return part.unflatten(0, shape)[:, 0]
