@@ -1,10 +1,7 @@
 """What all actor-critic algorithms of this package share: distributional twin critics, novelty, and the loop around them."""
 
-import io
-import pathlib
 import warnings
 from collections import defaultdict
-from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -13,9 +10,7 @@ from gymnasium import spaces
 from scipy.signal import lfilter
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
@@ -24,8 +19,10 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.features import declared_cell_size, declared_mode_features, describe_env
-from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, noveld_reward
+from sb3_ddiffpg.interrupts import handlers_restored
+from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, VisitCounts, noveld_reward
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
+from sb3_ddiffpg.persistence import SavableAlgorithm
 from sb3_ddiffpg.trajectories import Trajectory
 from sb3_ddiffpg.twin_critic_policy import TwinCriticPolicy
 from sb3_ddiffpg.validation import check_arguments
@@ -39,7 +36,7 @@ LARGEST_INTRINSIC = 10.0
 CUT_VALUES, MOST_CUT_VALUES = "values_at_limit", 0.02
 
 
-class NoveltyActorCritic(OffPolicyAlgorithm):
+class NoveltyActorCritic(SavableAlgorithm):
     """
     Off-policy actor-critic with distributional twin critics, whose reward is the environment's and NovelD's
     (Zhang et al., 2021). A subclass says in ``_update_actor`` how its actor learns.
@@ -75,6 +72,8 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
     :param novelty_scale: The factor alpha of NovelD
     :param intrinsic_coef: Factor c on the intrinsic reward
     :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation
+    :param episodic_novelty: Whether a place pays only when it is reached for the first time in an episode (Zhang et al., 2021,
+        section 3): otherwise explorers stand where fewest have been
     :param max_grad_norm: Largest gradient norm of the actor and of each group's critics
     :param stats_window_size: Window size for the rollout logging
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
@@ -126,6 +125,7 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
         novelty_scale: float = 0.5,
         intrinsic_coef: float = 0.05,
         normalize_intrinsic: bool = True,
+        episodic_novelty: bool = True,
         max_grad_norm: float = 1.0,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -178,6 +178,7 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
         self.novelty_scale = novelty_scale
         self.intrinsic_coef = intrinsic_coef
         self.normalize_intrinsic = normalize_intrinsic
+        self.episodic_novelty = episodic_novelty
         self.max_grad_norm = max_grad_norm
 
         self.is_normalized = False
@@ -204,7 +205,11 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
 
     def _buffer_arguments(self) -> dict[str, Any]:
         """What they say about the replay buffer."""
-        return {"mode_features": self._resolved_features, "success_key": self.success_key}
+        arguments = {"mode_features": self._resolved_features, "success_key": self.success_key}
+        if self.episodic_novelty:
+            cell_size = VisitCounts.default_cell_size if self.novelty == "counts" else declared_cell_size(self.env)
+            arguments["visit_cell_size"] = (self.novelty_kwargs or {}).get("cell_size", cell_size)
+        return arguments
 
     def _check_arguments(self) -> None:
         check_arguments(self, self._policy_arguments)
@@ -321,6 +326,9 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
         inputs = [self._novelty_inputs(obs) for obs in self.replay_buffer.read_observations(windows[present])]
         now, then = (self.novelty_model.novelty(*each) for each in inputs)
         reward = noveld_reward(now, then, self.novelty_scale)
+        if self.episodic_novelty:
+            first = self.replay_buffer.first_visits[windows[present]]
+            reward = reward * th.from_numpy(first).to(self.device, non_blocking=True)
         metrics["intrinsic_reward"].append(reward.mean())
         if self.normalize_intrinsic:
             self.intrinsic_moments.update(reward[:, None])
@@ -449,7 +457,8 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
         # Denormal numbers in Adam's moments slow a small update down by half
         th.set_flush_denormal(True)
         try:
-            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+            with handlers_restored():
+                return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         finally:
             th.set_flush_denormal(False)
 
@@ -478,6 +487,9 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
         self._update_current_progress_remaining(self.num_timesteps, max(total_timesteps, 1))
         if new_episodes:
             self._begin_episodes()
+        if self._interrupted is not None:
+            interrupted, self._interrupted = self._interrupted, None
+            interrupted.go_on(self, callback)
         return total_timesteps, callback
 
     def _begin_episodes(self) -> None:
@@ -512,33 +524,6 @@ class NoveltyActorCritic(OffPolicyAlgorithm):
         return rollout
 
     # ------------------------------------------------------------------ saving
-
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-        optimizers: bool = True,
-    ) -> None:
-        """
-        See SB3.
-
-        :param path: Path to the file
-        :param exclude: Attributes to leave out
-        :param include: Attributes to save though they are usually left out
-        :param optimizers: Whether what the optimisers have gathered is saved; without it the file is half as large, and
-            training that goes on from it begins with fresh ones
-        """
-        attributes = (recursive_getattr(self, name) for name in self._get_torch_save_params()[0])
-        left_out = [each for each in attributes if isinstance(each, th.optim.Optimizer) and not optimizers]
-        states = [optimizer.state for optimizer in left_out]
-        try:
-            for optimizer in left_out:
-                optimizer.state = defaultdict(dict)
-            super().save(path, exclude, include)
-        finally:
-            for optimizer, state in zip(left_out, states, strict=True):
-                optimizer.state = state
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor"]

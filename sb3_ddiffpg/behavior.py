@@ -1,10 +1,22 @@
 """What drives each environment through its episode: exploration, a mode, or the zero embedding."""
 
+from typing import Any
+
+import msgspec
 import numpy as np
+
+from sb3_ddiffpg.safe_files import check_array, convert
 
 # Rows of the policy's embedding table: 0 explores, m + 1 is mode m. No row: the zero embedding.
 EXPLORATORY_GROUP = 0
 UNCONDITIONED = -1
+
+
+class _State(msgspec.Struct, forbid_unknown_fields=True):
+    groups: np.ndarray
+    handed_over: np.ndarray
+    may_hand_over: np.ndarray
+    n_turns: int
 
 
 class Behavior:
@@ -90,3 +102,27 @@ class Behavior:
         """
         groups = {old + 1: UNCONDITIONED if new is None else new + 1 for old, new in enumerate(new_modes)}
         self.groups = np.array([groups.get(group, group) for group in self.groups.tolist()], dtype=np.int64)
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: Who drives what, for ``load_state_dict``
+        """
+        return {name: getattr(self, name) for name in _State.__struct_fields__}
+
+    def load_state_dict(self, state: Any, n_modes: int) -> None:
+        """
+        :param state: What ``state_dict`` gave
+        :param n_modes: Number of modes M
+        :raises ValueError: If it is something else
+        """
+        known = convert(state, _State, "behavior")
+        check_array(known.groups, np.int64, [None], "behavior.groups")
+        for name in ("handed_over", "may_hand_over"):
+            check_array(getattr(known, name), bool, known.groups.shape, f"behavior.{name}")
+        if len(known.groups) and not UNCONDITIONED <= known.groups.min() <= known.groups.max() <= n_modes:
+            raise ValueError(
+                f"behavior.groups: there are {n_modes} modes, groups from {known.groups.min()} to {known.groups.max()}"
+            )
+        for name in _State.__struct_fields__:
+            value = getattr(known, name)
+            setattr(self, name, value.copy() if isinstance(value, np.ndarray) else value)

@@ -45,7 +45,7 @@ class ModeBatch(NamedTuple):
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
     *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct", "loop_share", "route_share"),
-    *("new_way_share", "explore_beyond_goals"),
+    *("new_way_share", "explore_beyond_goals", "visit_cell_size"),
 )
 
 
@@ -77,6 +77,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     :param new_way_share: Share of the exploratory group's rows that are drawn from trajectories which reached a goal by a way
         of which a mode has not its fill
     :param explore_beyond_goals: Whether a goal does not end the exploratory group's returns
+    :param visit_cell_size: Edge of the cells of mode features by which ``first_visits`` are told; None: every step is one
     :raises ValueError: If a size is not positive or ``optimize_memory_usage`` is asked for
     """
 
@@ -86,6 +87,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     off_route: np.ndarray
     way_novelty: np.ndarray
     goals: np.ndarray
+    first_visits: np.ndarray
 
     def __init__(
         self,
@@ -109,6 +111,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         route_share: float = 0.1,
         new_way_share: float = 0.0,
         explore_beyond_goals: bool = False,
+        visit_cell_size: float | None = None,
     ) -> None:
         for name, value, least in (
             ("max_successes_per_mode", max_successes_per_mode, 1),
@@ -133,6 +136,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.route_share = route_share
         self.new_way_share = new_way_share
         self.explore_beyond_goals = explore_beyond_goals
+        if visit_cell_size is not None and not visit_cell_size > 0:
+            raise ValueError(f"visit_cell_size must be positive, got {visit_cell_size}")
+        self.visit_cell_size = visit_cell_size
         super().__init__(
             buffer_size,
             observation_space,
@@ -157,6 +163,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self._last_positions = np.empty((0, self.features.dim), dtype=np.float32)
         self.mode_rows: list[RowSet] = []
         self._new_way_rows = np.empty(0, dtype=np.int32)
+        self._episode_cells: list[set[tuple[int, ...]]] = [set() for _ in range(self.n_envs)]
 
     def _step_fields(self) -> Fields:
         action = ((self.action_dim,), np.float32)
@@ -164,10 +171,11 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
 
     def _note_fields(self) -> Fields:
         own = {"foreign": ((), bool), "off_route": ((), bool), "way_novelty": ((), np.float32), "goals": ((), bool)}
+        own["first_visits"] = (), bool
         return {**super()._note_fields(), **own}
 
     def _view_names(self) -> list[str]:
-        own = ["target_actions", "exploratory_target_actions", "foreign", "off_route", "way_novelty", "goals"]
+        own = ["target_actions", "exploratory_target_actions", "foreign", "off_route", "way_novelty", "goals", "first_visits"]
         return [*super()._view_names(), *own]
 
     def _position_arrays(self) -> list[np.ndarray]:
@@ -179,6 +187,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.exploratory_target_actions = self._steps["exploratory_target_actions"]
         self.foreign, self.off_route = self._notes["foreign"], self._notes["off_route"]
         self.way_novelty, self.goals = self._notes["way_novelty"], self._notes["goals"]
+        self.first_visits = self._notes["first_visits"]
         self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
         for row_set in self.mode_rows:
             row_set.position = self._mode_position
@@ -190,10 +199,39 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.foreign[rows] = self.off_route[rows] = self.goals[rows] = False
         self.way_novelty[rows] = 0.0
         self._last_positions = self.features(next_obs)
+        self.first_visits[rows] = self._are_first_visits(self._last_positions)
+
+    def _are_first_visits(self, positions: np.ndarray) -> np.ndarray:
+        """Whether each environment is where it has not been in this episode, [n_envs]; from now on it has."""
+        first = np.ones(len(positions), dtype=bool)
+        if self.visit_cell_size is not None:
+            cells = np.floor(positions / self.visit_cell_size).astype(np.int64).tolist()
+            for env, (cell, seen) in enumerate(zip(map(tuple, cells), self._episode_cells, strict=True)):
+                first[env] = cell not in seen
+                seen.add(cell)
+        return first
+
+    def drop_unfinished_episodes(self) -> None:
+        """Forget the transitions of running episodes: call it when the environments were reset outside."""
+        super().drop_unfinished_episodes()
+        for seen in self._episode_cells:
+            seen.clear()
+
+    def recall_visits(self) -> None:
+        """After loading: the places where the running episodes have been."""
+        if self.visit_cell_size is None or not self._allocated:
+            return
+        for env, seen in enumerate(self._episode_cells):
+            seen.clear()
+            rows = self._running[env, : self._running_length[env]]
+            if len(rows):
+                positions = self._positions(self._nexts, "next_observations", rows)
+                seen.update(map(tuple, np.floor(positions / self.visit_cell_size).astype(np.int64).tolist()))
 
     def _finish(self, env: int, info: dict[str, Any]) -> Trajectory:
         trajectory = super()._finish(env, info)
         self.goals[trajectory.rows[-1]] = trajectory.success
+        self._episode_cells[env].clear()
         return trajectory
 
     def _evict(self) -> Trajectory:

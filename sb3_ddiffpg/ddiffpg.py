@@ -23,7 +23,7 @@ from sb3_ddiffpg.callbacks import ClusteringCallback, contains_clustering
 from sb3_ddiffpg.features import same_selection
 from sb3_ddiffpg.history import ModeHistory
 from sb3_ddiffpg.mode_control import ModeControl
-from sb3_ddiffpg.modes import Mode, ModeTable, Outcome, default_name
+from sb3_ddiffpg.modes import Mode, ModeTable, Outcome, default_name, modes_from_state, modes_state
 from sb3_ddiffpg.policies import DiffusionActor, DiffusionPolicy
 from sb3_ddiffpg.target_actions import ascend
 from sb3_ddiffpg.trajectories import NO_MODE
@@ -111,6 +111,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param new_way_coef: Factor on the environment's reward that the exploratory critics get for goals reached by ways that are
         in no mode, or in one that has not its fill of trajectories yet: a second way is worth finding where the first pays
     :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation
+    :param episodic_novelty: Whether a place pays only when it is reached for the first time in an episode (Zhang et al., 2021,
+        section 3): otherwise explorers stand where fewest have been
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
     :param max_grad_norm: Largest gradient norm of the policy and of each mode's critics
@@ -135,6 +137,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     actor: DiffusionActor
     replay_buffer: ModeReplayBuffer
     _exploration_limit = "exploration_v_max"
+    _counters: ClassVar[dict[str, Any]] = {"n_rollouts": int, "run_id": str, "_next_mode_number": int, "_steps_before": int}
 
     def __init__(
         self,
@@ -195,6 +198,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         mode_intrinsic_coef: float = 0.0,
         new_way_coef: float = 0.0,
         normalize_intrinsic: bool = True,
+        episodic_novelty: bool = True,
         reset_new_critics: bool = True,
         max_grad_norm: float = 1.0,
         control: str | None = None,
@@ -238,6 +242,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             novelty_scale=novelty_scale,
             intrinsic_coef=intrinsic_coef,
             normalize_intrinsic=normalize_intrinsic,
+            episodic_novelty=episodic_novelty,
             max_grad_norm=max_grad_norm,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
@@ -484,6 +489,37 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         return super()._init_callback(callbacks, progress_bar)
 
     # ------------------------------------------------------------------ saving
+
+    def state_tree(self) -> dict[str, Any]:
+        """
+        :return: See ``NoveltyActorCritic``; and the modes
+        """
+        modes = {"modes": modes_state(self._modes), "history": self.mode_history.state_dict()}
+        return {**super().state_tree(), **modes}
+
+    def load_state_tree(self, tree: Any) -> None:
+        """
+        :param tree: What ``state_tree`` gave
+        :raises ValueError: If it is something else
+        """
+        super().load_state_tree(tree)
+        self._modes = modes_from_state(tree.get("modes"))
+        self.mode_history = ModeHistory.from_state(tree.get("history"))
+        if any(mode.number >= self._next_mode_number for mode in self._modes):
+            raise ValueError(f"model.state: a mode has a number that is not below {self._next_mode_number}, the next one's")
+
+    def episodes_tree(self) -> dict[str, Any]:
+        """
+        :return: Which group drives which environment
+        """
+        return self._behavior.state_dict()
+
+    def load_episodes_tree(self, tree: dict[str, Any]) -> None:
+        """
+        :param tree: What ``episodes_tree`` gave
+        :raises ValueError: If it is something else
+        """
+        self._behavior.load_state_dict(tree, len(self._modes))
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"

@@ -2,10 +2,12 @@
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 from sb3_ddiffpg.clustering import Inheritance
 from sb3_ddiffpg.modes import Mode, default_name
+from sb3_ddiffpg.safe_files import convert
 
 #: What can happen to a mode; those of the second row by hand
 EVENT_KINDS = (
@@ -71,6 +73,25 @@ class ModeHistory:
         :param modes: The modes at a re-clustering
         """
         self.states += [ModeState(step, mode.number, mode.n_trajectories, mode.success_rate) for mode in modes]
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: All of it, for ``from_state``
+        """
+        return asdict(self)
+
+    @classmethod
+    def from_state(cls, state: Any) -> "ModeHistory":
+        """
+        :param state: What ``state_dict`` gave
+        :return: The same history
+        :raises ValueError: If it is something else
+        """
+        history = convert(state, cls, "history")
+        unknown = {event.kind for event in history.events} - set(EVENT_KINDS)
+        if unknown:
+            raise ValueError(f"history: nothing that can happen to a mode is called {sorted(unknown)}")
+        return history
 
     def share_kept(self, min_trajectories: int = 20, from_step: int = 0) -> float:
         """

@@ -1,4 +1,4 @@
-"""Ctrl-C between changes that belong together."""
+"""Ctrl-C between changes that belong together, and handlers that are put back."""
 
 import signal
 import threading
@@ -21,3 +21,16 @@ def uninterrupted() -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
         if received:
             signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def handlers_restored() -> Iterator[None]:
+    """What is set inside to handle SIGINT and SIGTERM ends with the block."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            if handler is not None and signal.getsignal(number) is not handler:
+                signal.signal(number, handler)

@@ -156,9 +156,12 @@ class VisitCounts(nn.Module):
     :param table_size: Number of entries of the hash table
     """
 
+    default_cell_size = 0.5
     counts: th.Tensor
 
-    def __init__(self, position_dim: int, observation_dim: int, cell_size: float = 0.5, table_size: int = 2**16) -> None:
+    def __init__(
+        self, position_dim: int, observation_dim: int, cell_size: float = default_cell_size, table_size: int = 2**16
+    ) -> None:
         super().__init__()
         if cell_size <= 0:
             raise ValueError(f"novelty_kwargs['cell_size'] must be positive, got {cell_size}")

@@ -12,14 +12,11 @@ from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.clustering import cluster
 from sb3_ddiffpg.history import ModeEvent, ModeHistory, succeed
 from sb3_ddiffpg.interrupts import uninterrupted
-from sb3_ddiffpg.modes import Mode, ModeTable, default_name
+from sb3_ddiffpg.modes import ACCEPTED_NAME, Mode, ModeTable, default_name
 from sb3_ddiffpg.policies import DiffusionPolicy
 from sb3_ddiffpg.reclustering import Reclustering, find_modes
 from sb3_ddiffpg.trajectories import NO_MODE
 from sb3_ddiffpg.visits import VisitMap
-
-# A name stands in tables, legends, on command lines (where a number would be an index) and in tags of a log that cuts them
-_NAME = re.compile(r"(?!_)(?=.*[^\W\d])[\w .+-]{1,24}")
 
 
 class ModeControl:
@@ -135,7 +132,7 @@ class ModeControl:
         :raises ValueError: If there is no such mode, or another has that name or may be born with it
         """
         record = self._modes[ModeTable(self._modes).index(mode)]
-        if not isinstance(name, str) or not _NAME.fullmatch(name) or name != name.strip():
+        if not isinstance(name, str) or not ACCEPTED_NAME.fullmatch(name) or name != name.strip():
             raise ValueError(
                 f"name={name!r} is no name of a mode: accepted are 1 to 24 letters, digits, spaces and _.+-, not digits alone"
             )

@@ -1,10 +1,18 @@
 """Who is who among the modes: numbers and names, statistics, and the table behind ``model.modes``."""
 
+import re
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
+from typing import Any
 
+import msgspec
 import numpy as np
+
+from sb3_ddiffpg.safe_files import check_array, convert
+
+# A name stands in tables, legends, on command lines (where a number would be an index) and in tags of a log that cuts them
+ACCEPTED_NAME = re.compile(r"(?!_)(?=.*[^\W\d])[\w .+-]{1,24}")
 
 
 @dataclass(frozen=True)
@@ -81,6 +89,53 @@ class Mode:
 
     def _mean(self, name: str) -> float:
         return float(np.mean([getattr(outcome, name) for outcome in self.outcomes])) if self.outcomes else float("nan")
+
+
+class _State(msgspec.Struct, forbid_unknown_fields=True):
+    number: int
+    name: str
+    born_at: int
+    n_trajectories: int
+    mean_length: float
+    mean_return: float
+    representative: np.ndarray
+    frozen: bool
+    outcomes: list[tuple[bool, float, int]]
+    doubts: int
+    misses: int
+    unjudged: int
+
+
+def modes_state(modes: Sequence[Mode]) -> list[dict[str, Any]]:
+    """
+    :param modes: Of a model
+    :return: All that is known of them, in plain values and arrays
+    """
+    plain = [name for name in _State.__struct_fields__ if name != "outcomes"]
+    return [
+        {**{name: getattr(mode, name) for name in plain}, "outcomes": [astuple(each) for each in mode.outcomes]}
+        for mode in modes
+    ]
+
+
+def modes_from_state(state: Any) -> list[Mode]:
+    """
+    :param state: What ``modes_state`` gave
+    :return: The modes
+    :raises ValueError: If it is something else
+    """
+    modes = []
+    for known in convert(state, list[_State], "modes"):
+        check_array(known.representative, np.float32, [None, None], "modes.representative")
+        if not ACCEPTED_NAME.fullmatch(known.name):
+            raise ValueError(f"modes: {known.name[:50]!r} is no name of a mode")
+        values = {name: getattr(known, name) for name in known.__struct_fields__ if name != "outcomes"}
+        modes.append(Mode(**values))
+        modes[-1].outcomes.extend(Outcome(*each) for each in known.outcomes)
+    for what in ("number", "name"):
+        if len({getattr(mode, what) for mode in modes}) < len(modes):
+            raise ValueError(f"modes: two have the same {what}")
+    return modes
 
 
 class ModeTable(Sequence[Mode]):

@@ -1,11 +1,23 @@
 """Where a run has been: visits by cell, and how many cells were known when."""
 
 from collections import Counter
+from typing import Any
 
+import msgspec
 import numpy as np
+
+from sb3_ddiffpg.safe_files import check_array, convert
 
 _BITS = 21  # of each coordinate in a key
 _OFFSET = 1 << (_BITS - 1)
+
+
+class _State(msgspec.Struct, forbid_unknown_fields=True):
+    dim: int
+    cell_size: float
+    keys: np.ndarray
+    visits: np.ndarray
+    coverage: np.ndarray
 
 
 class VisitMap:
@@ -55,3 +67,33 @@ class VisitMap:
         visits = np.fromiter(self._counts.values(), dtype=np.int64, count=len(self))
         parts = [(keys >> (_BITS * axis)) & ((1 << _BITS) - 1) for axis in reversed(range(self.dim))]
         return (np.stack(parts, axis=1) - _OFFSET + 0.5) * self.cell_size, visits
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: All that it knows, for ``from_state``
+        """
+        return {
+            "dim": self.dim,
+            "cell_size": float(self.cell_size),
+            "keys": np.fromiter(self._counts.keys(), dtype=np.int64, count=len(self)),
+            "visits": np.fromiter(self._counts.values(), dtype=np.int64, count=len(self)),
+            "coverage": np.array(self.coverage, dtype=np.int64).reshape(-1, 2),
+        }
+
+    @classmethod
+    def from_state(cls, state: Any) -> "VisitMap":
+        """
+        :param state: What ``state_dict`` gave
+        :return: A map that knows the same
+        :raises ValueError: If it is something else
+        """
+        known = convert(state, _State, "visits")
+        made = cls(known.dim, known.cell_size)
+        check_array(known.keys, np.int64, [None], "visits.keys")
+        check_array(known.visits, np.int64, known.keys.shape, "visits.visits")
+        check_array(known.coverage, np.int64, [None, 2], "visits.coverage")
+        if (known.keys < 0).any() or (known.keys >> (_BITS * known.dim)).any() or (known.visits < 1).any():
+            raise ValueError("visits: there are cells or counts that cannot be")
+        made._counts.update(dict(zip(known.keys.tolist(), known.visits.tolist(), strict=True)))
+        made.coverage = [(step, cells) for step, cells in known.coverage.tolist()]
+        return made

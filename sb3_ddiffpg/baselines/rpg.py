@@ -23,6 +23,7 @@ from sb3_ddiffpg.actor_critic import CUT_VALUES, NoveltyActorCritic
 from sb3_ddiffpg.baselines.baseline import FifoReplayBuffer, names_of
 from sb3_ddiffpg.baselines.sac_c51 import GaussianActor
 from sb3_ddiffpg.baselines.world_model import WorldModel
+from sb3_ddiffpg.safe_files import check_array, convert
 from sb3_ddiffpg.twin_critic_policy import default_extractor
 
 
@@ -311,6 +312,7 @@ class RPG(NoveltyActorCritic):
 
     default_replay_buffer_class = FifoReplayBuffer
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(RPGPolicy)
+    _counters: ClassVar[dict[str, Any]] = {"_n_model_updates": int}
     policy: RPGPolicy  # type: ignore[assignment]
 
     def __init__(
@@ -507,6 +509,20 @@ class RPG(NoveltyActorCritic):
         self._episode_latents[ended] = self.policy.draw_latents(len(ended)).cpu().numpy()
 
     # ------------------------------------------------------------------ saving
+
+    def episodes_tree(self) -> dict[str, Any]:
+        """
+        :return: The latent variable of each environment's episode
+        """
+        return {"latents": self._episode_latents}
+
+    def load_episodes_tree(self, tree: dict[str, Any]) -> None:
+        """
+        :param tree: What ``episodes_tree`` gave
+        :raises ValueError: If it is something else
+        """
+        latents = convert(tree.get("latents"), np.ndarray, "episodes.latents")
+        self._episode_latents = check_array(latents, np.float32, [self.n_envs, self.latent_dim], "episodes.latents").copy()
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()

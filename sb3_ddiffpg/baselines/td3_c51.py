@@ -69,6 +69,7 @@ class TD3C51(Baseline):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(TanhActorPolicy)
+    _counters: ClassVar[dict[str, Any]] = {"_n_critic_updates": int}
 
     def __init__(self, policy: str | type[BasePolicy], env: Any, *, policy_delay: int = 1, **kwargs: Any) -> None:
         self.policy_delay = policy_delay

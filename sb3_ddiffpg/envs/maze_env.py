@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
@@ -15,6 +16,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from sb3_ddiffpg.envs.drawing import Image
 from sb3_ddiffpg.envs.maze_simulation import MazeSimulation
 from sb3_ddiffpg.envs.mazes import MazeMap
+from sb3_ddiffpg.rng import restore_generator
+from sb3_ddiffpg.safe_files import check_array, convert
 
 #: Edge of the floor's cells in which visits are counted, in metres
 VISIT_CELL = 1.0
@@ -34,6 +37,17 @@ def reset_info(simulation: MazeSimulation, i: int) -> dict[str, Any]:
     :return: what ``reset`` tells of it
     """
     return {"blocked": simulation.blocked[i]} if simulation.has_obstacles else {}
+
+
+class _EnvState(msgspec.Struct, forbid_unknown_fields=True):
+    simulation: Any
+    random: Any
+
+
+class _VecState(msgspec.Struct, forbid_unknown_fields=True):
+    simulation: Any
+    random: list[Any]
+    steps: np.ndarray
 
 
 class MazeEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
@@ -88,6 +102,21 @@ class MazeEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
             info.update(goal_id=goal_id, mode=self.simulation.label(0, goal_id))
         terminated = goal_id >= 0 or bool(self.simulation.lost()[0])
         return self.simulation.observations()[0], float(self.simulation.rewards[goal_id]), terminated, False, info
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: where the episode is, and the state of ``np_random``, for ``load_state_dict``
+        """
+        return {"simulation": self.simulation.state_dict(), "random": self.np_random.bit_generator.state}
+
+    def load_state_dict(self, state: Any) -> None:
+        """
+        :param state: what ``state_dict`` gave
+        :raises ValueError: if it is of another environment
+        """
+        known = convert(state, _EnvState, "environment")
+        self.simulation.load_state_dict(known.simulation)
+        restore_generator(self.np_random, known.random)
 
     def render(self) -> Image | None:
         """
@@ -194,6 +223,27 @@ class MazeVecEnv(VecEnv):
     def _close_episode(self, i: int, goal_id: int, info: dict[str, Any]) -> None:
         if goal_id >= 0:
             info.update(is_success=True, goal_id=goal_id, mode=self.simulation.label(i, goal_id))
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: where the episodes are, and the random states of the next ones, for ``load_state_dict``
+        """
+        random = [rng.bit_generator.state for rng in self._rngs]
+        return {"simulation": self.simulation.state_dict(), "random": random, "steps": self._steps}
+
+    def load_state_dict(self, state: Any) -> None:
+        """
+        :param state: what ``state_dict`` gave
+        :raises ValueError: if it is of other environments
+        """
+        known = convert(state, _VecState, "environments")
+        steps = check_array(known.steps, np.int64, [self.num_envs], "environments.steps")
+        if len(known.random) != self.num_envs:
+            raise ValueError(f"environments.random: {len(known.random)} states for {self.num_envs} environments")
+        self.simulation.load_state_dict(known.simulation)
+        for rng, each in zip(self._rngs, known.random, strict=True):
+            restore_generator(rng, each)
+        self._steps = steps.copy()
 
     def close(self) -> None:
         """Release what pictures needed."""

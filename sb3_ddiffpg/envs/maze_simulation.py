@@ -5,12 +5,14 @@ from itertools import combinations
 from math import comb
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_ddiffpg.envs.drawing import OBSTACLE, Image, draw_maze, fill_square
 from sb3_ddiffpg.envs.mazes import CELL_SIZE, FloatArray, HomotopyTracker, Maze, MazeMap, cell_distances
+from sb3_ddiffpg.safe_files import check_array, convert
 
 Cell = tuple[int, int]
 
@@ -23,6 +25,12 @@ class Start(NamedTuple):
 
     position: FloatArray
     blocked: tuple[Cell, ...] = ()
+
+
+class _State(msgspec.Struct, forbid_unknown_fields=True):
+    bodies: np.ndarray
+    blocked: list[list[Cell]]
+    routes: Any
 
 
 class MazeSimulation:
@@ -42,6 +50,8 @@ class MazeSimulation:
 
     #: Half the side of the square in which a body fits, in metres.
     half_size: float
+    #: Of all bodies, as the subclass arranges it.
+    _state: FloatArray
     #: Components of an action.
     action_dim: int
 
@@ -199,6 +209,30 @@ class MazeSimulation:
         :return: whether each body cannot go on, so that its episode ends, shape (n,)
         """
         return np.zeros(self.n, dtype=bool)
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: where every body's episode is, for ``load_state_dict``
+        """
+        blocked = [[list(cell) for cell in cells] for cells in self.blocked]
+        return {"bodies": self._state, "blocked": blocked, "routes": self._tracker.state_dict()}
+
+    def load_state_dict(self, state: Any) -> None:
+        """
+        :param state: what ``state_dict`` gave
+        :raises ValueError: if it is of other bodies or another maze
+        """
+        known = convert(state, _State, "simulation")
+        bodies = check_array(known.bodies, self._state.dtype, self._state.shape, "simulation.bodies")
+        if not np.isfinite(bodies).all():
+            raise ValueError("simulation.bodies: not finite")
+        if len(known.blocked) != self.n:
+            raise ValueError(f"simulation.blocked: of {len(known.blocked)} bodies, there are {self.n}")
+        blocked = [self._checked(cells) if cells else () for cells in known.blocked]
+        self._tracker.load_state_dict(known.routes)
+        self.blocked = blocked
+        self._place(range(self.n), self.positions())  # what stands around them
+        self._state = bodies.copy()
 
     def label(self, i: int, goal_id: int) -> str:
         """

@@ -7,10 +7,13 @@ Positions are in metres, x to the right and y upwards. The centre of the start c
 import re
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
+
+from sb3_ddiffpg.safe_files import check_array, convert
 
 #: Side of a map cell, in metres.
 CELL_SIZE = 4.0
@@ -327,6 +330,11 @@ def format_label(goal_id: int, word: str) -> str:
     return f"{goal_id}:{word or '-'}"
 
 
+class _TrackerState(msgspec.Struct, forbid_unknown_fields=True):
+    positions: np.ndarray
+    words: list[list[str]]
+
+
 class HomotopyTracker:
     """
     Keeps the reduced words of n bodies that move through one maze together.
@@ -361,6 +369,24 @@ class HomotopyTracker:
         for i, letter in self.maze.crossings(self._positions, positions):
             _append(self._words[i], letter)
         self._positions[:] = positions
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: positions and words, for ``load_state_dict``
+        """
+        return {"positions": self._positions, "words": self._words}
+
+    def load_state_dict(self, state: Any) -> None:
+        """
+        :param state: what ``state_dict`` gave
+        :raises ValueError: if it is of other bodies
+        """
+        known = convert(state, _TrackerState, "routes")
+        positions = check_array(known.positions, np.float64, self._positions.shape, "routes.positions")
+        letters = {case for cut in self.maze.cuts for case in (cut.letter, cut.letter.upper())}
+        if len(known.words) != len(self._words) or not letters.issuperset(set().union(*known.words)):
+            raise ValueError(f"routes: the words of {len(known.words)} bodies do not fit {len(self._words)} in this maze")
+        self._positions, self._words = positions.copy(), known.words
 
     def word(self, i: int) -> str:
         """

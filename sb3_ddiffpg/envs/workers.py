@@ -14,7 +14,9 @@ import numpy as np
 from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from sb3_ddiffpg.envs.snapshots import env_snapshot, restore_env
 from sb3_ddiffpg.interrupts import uninterrupted
+from sb3_ddiffpg.safe_files import convert
 
 
 def n_processors() -> int:
@@ -69,6 +71,12 @@ def _answer(envs: Any, command: str, argument: Any) -> Any:
         return envs.reset(), envs.reset_infos
     if command == "step":
         return *envs.step(argument), envs.reset_infos
+    if command == "state_dict":
+        return [env_snapshot(env) for env in envs.envs]
+    if command == "load_state_dict":
+        for env, state in zip(envs.envs, argument, strict=True):
+            restore_env(env, state)
+        return None
     name, arguments, keywords = argument
     indices = keywords.pop("indices", None)
     if indices is None:
@@ -209,6 +217,22 @@ class WorkerVecEnv(VecEnv):
         self.reset_infos = [info for part in reset_infos for info in part]
         joined = [info for part in infos for info in part]
         return self._join(list(observations)), np.concatenate(rewards), np.concatenate(dones), joined
+
+    def state_dict(self) -> list[Any]:
+        """
+        :return: of each environment what ``env_snapshot`` gives, for ``load_state_dict``
+        """
+        return [each for part in self._ask("state_dict", [None] * len(self.remotes)) for each in part]
+
+    def load_state_dict(self, state: Any) -> None:
+        """
+        :param state: what ``state_dict`` gave
+        :raises ValueError: if it is of other environments
+        """
+        states = convert(state, list[Any], "environments")
+        if len(states) != self.num_envs:
+            raise ValueError(f"environments: {len(states)} saved, there are {self.num_envs}")
+        self._ask("load_state_dict", self._split(states))
 
     def close(self) -> None:
         """End the workers; those that do not end by themselves are killed."""

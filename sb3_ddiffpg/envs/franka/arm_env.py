@@ -3,16 +3,25 @@
 from typing import Any, ClassVar
 
 import gymnasium as gym
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_ddiffpg.envs.franka.arm import FloatArray, PandaArm
 from sb3_ddiffpg.envs.franka.bodies import Color, Triple, box
+from sb3_ddiffpg.rng import restore_generator
+from sb3_ddiffpg.safe_files import check_array, convert
 
 Image = npt.NDArray[np.uint8]
 
 _METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}
+
+
+class _State(msgspec.Struct, forbid_unknown_fields=True):
+    start: np.ndarray | None
+    actions: np.ndarray
+    random: Any
 
 
 class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
@@ -121,6 +130,33 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
             if self.arm.penetration() < 1e-3:
                 break
         return self._observation(), {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: how the episode has gone so far, and the state of ``np_random``, for ``load_state_dict``
+        """
+        actions = np.array(self._actions).reshape(-1, 7)
+        return {"start": self._start, "actions": actions, "random": self.np_random.bit_generator.state}
+
+    def load_state_dict(self, state: Any) -> None:
+        """
+        Go the episode's way again: that is exact, and bullet's own pictures of a world in contact are not.
+
+        :param state: what ``state_dict`` gave
+        :raises ValueError: if it is of another environment
+        """
+        known = convert(state, _State, "environment")
+        actions = check_array(known.actions, np.float64, [None, 7], "environment.actions")
+        if known.start is not None:
+            check_array(known.start, np.float64, [7], "environment.start")
+        if not np.isfinite(actions).all() or not np.isfinite(0.0 if known.start is None else known.start).all():
+            raise ValueError("environment: angles or actions are not finite")
+        restore_generator(self.np_random, known.random)
+        self._start, self._actions = None, []
+        if known.start is not None:
+            self._start_episode(known.start)
+            for action in actions:
+                self._move(action)
 
     def _start_episode(self, angles: FloatArray) -> None:
         self._start, self._actions = angles, []

@@ -1,0 +1,250 @@
+"""Checkpoints of a whole run: written so that no crash loses the one before, and from which it goes on bit for bit."""
+
+import errno
+import signal
+import threading
+import warnings
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+
+from sb3_ddiffpg.buffer_state import buffer_state, restore_buffer
+from sb3_ddiffpg.envs.snapshots import restore_vec_env, vec_env_snapshot
+from sb3_ddiffpg.model_file import model_tree
+from sb3_ddiffpg.plain_values import from_plain, to_plain
+from sb3_ddiffpg.rng import global_rng, restore_global_rng
+from sb3_ddiffpg.safe_files import convert, read, write
+
+#: What the file says it is
+KIND = "checkpoint"
+
+
+class _Callback(msgspec.Struct, forbid_unknown_fields=True):
+    kind: str
+    state: dict[str, Any]
+
+
+class _Run(msgspec.Struct, forbid_unknown_fields=True):
+    last_obs: Any
+    last_original_obs: Any
+    last_episode_starts: np.ndarray
+    episode_infos: list[dict[str, float]]
+    episode_successes: list[float]
+    noise: Any
+    episodes: dict[str, Any]
+    environments: Any
+    buffer: Any
+    random: Any
+    callbacks: list[_Callback]
+
+
+class _Checkpoint(msgspec.Struct, forbid_unknown_fields=True):
+    model: Any
+    run: _Run
+
+
+def checkpoint_files(folder: str | Path) -> list[Path]:
+    """
+    :param folder: Where a ``RunCheckpointCallback`` writes
+    :return: Its checkpoints, the newest first
+    """
+    return sorted(Path(folder).glob("checkpoint_*.safetensors"), reverse=True)
+
+
+def read_checkpoint(path: str | Path) -> tuple[Path, _Checkpoint]:
+    """
+    :param path: Of a checkpoint, or of a folder of them, of which the newest that is whole is taken
+    :return: Which one, and what it holds
+    :raises FileNotFoundError: If there is none
+    :raises ValueError: If none is whole
+    """
+    path = Path(path)
+    candidates = checkpoint_files(path) if path.is_dir() else [path]
+    if not candidates:
+        raise FileNotFoundError(errno.ENOENT, "There is no checkpoint in this folder", str(path))
+    for candidate in candidates:
+        try:
+            return candidate, convert(read(candidate, KIND), _Checkpoint, "checkpoint")
+        except ValueError as error:
+            if candidate == candidates[-1]:
+                raise
+            warnings.warn(f"{error}. Going on with the checkpoint before it")
+    raise AssertionError
+
+
+def write_checkpoint(path: Path, model: Any, callback: BaseCallback | None = None) -> None:
+    """
+    :param path: Of the file
+    :param model: In the middle of ``learn``, at the beginning of a rollout
+    :param callback: All that is called in this training
+    :raises OSError: If it cannot be written; what was there before still is
+    """
+    infos = [{key: float(value) for key, value in each.items()} for each in model.ep_info_buffer or ()]
+    run = {
+        "last_obs": model._last_obs,
+        "last_original_obs": model._last_original_obs,
+        "last_episode_starts": model._last_episode_starts,
+        "episode_infos": infos,
+        "episode_successes": [float(each) for each in model.ep_success_buffer or ()],
+        "noise": to_plain(model.action_noise),
+        "episodes": model.episodes_tree(),
+        "environments": vec_env_snapshot(model.env),
+        "buffer": buffer_state(model.replay_buffer),
+        "random": global_rng(),
+        "callbacks": [{"kind": type(each).__name__, "state": _callback_state(each)} for each in _flatten(callback)],
+    }
+    write(path, KIND, {"model": model_tree(model), "run": run})
+
+
+class InterruptedRun:
+    """
+    What of a run must be put back when ``learn`` has begun again.
+
+    :param run: As read from a checkpoint
+    """
+
+    def __init__(self, run: Any) -> None:
+        self.run = run
+
+    def restore_buffer_and_environments(self, model: Any) -> None:
+        """
+        :param model: Built from the same checkpoint
+        :raises ValueError: If something does not fit the model or its environments
+        """
+        run = self.run
+        restore_buffer(model.replay_buffer, run.buffer)
+        model.ep_info_buffer = deque(run.episode_infos, maxlen=model._stats_window_size)
+        model.ep_success_buffer = deque(run.episode_successes, maxlen=model._stats_window_size)
+        if run.environments is None:
+            warnings.warn("These environments cannot be saved in the middle of an episode: new episodes begin")
+            return
+        restore_vec_env(model.env, run.environments)
+        model._last_obs, model._last_original_obs = _observation(run.last_obs), _observation(run.last_original_obs)
+        model._last_episode_starts = run.last_episode_starts
+
+    def go_on(self, model: Any, callback: BaseCallback) -> None:
+        """
+        :param model: Whose ``learn`` has begun
+        :param callback: All that is called in it
+        :raises ValueError: If something does not fit
+        """
+        run = self.run
+        if run.environments is not None:
+            model.load_episodes_tree(run.episodes)
+        model.action_noise = from_plain(run.noise)
+        known = [(each.kind, each.state) for each in run.callbacks]
+        for each in _flatten(callback):
+            match = next((i for i, (kind, _) in enumerate(known) if kind == type(each).__name__), None)
+            if match is not None:
+                _load_callback_state(each, known.pop(match)[1])
+        restore_global_rng(run.random)
+
+
+def _observation(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: convert(each, np.ndarray, f"last_obs.{key}") for key, each in value.items()}
+    return None if value is None else convert(value, np.ndarray, "last_obs")
+
+
+def _flatten(callback: BaseCallback | None) -> list[BaseCallback]:
+    if callback is None:
+        return []
+    if isinstance(callback, CallbackList):
+        return [each for child in callback.callbacks for each in _flatten(child)]
+    return [callback, *_flatten(getattr(callback, "callback", None))]
+
+
+def _callback_state(callback: BaseCallback) -> dict[str, Any]:
+    state: dict[str, Any] = {"n_calls": callback.n_calls}
+    if isinstance(callback, EvalCallback):
+        state["best_mean_reward"] = float(callback.best_mean_reward)
+    if hasattr(callback, "state_dict"):
+        state["own"] = callback.state_dict()
+    return state
+
+
+def _load_callback_state(callback: BaseCallback, state: dict[str, Any]) -> None:
+    callback.n_calls = convert(state.get("n_calls"), int, "callback.n_calls")
+    if isinstance(callback, EvalCallback) and "best_mean_reward" in state:
+        callback.best_mean_reward = convert(state["best_mean_reward"], float, "callback.best_mean_reward")
+    if hasattr(callback, "load_state_dict") and "own" in state:
+        callback.load_state_dict(state["own"])
+
+
+class RunCheckpointCallback(BaseCallback):
+    """
+    Writes the whole run to a file from time to time: networks, optimisers, replay buffer, modes, environments in the middle of
+    their episodes, and random states. ``DDiffPG.resume(folder, env)`` goes on from it.
+
+    A file is complete or it is not there, and holds its own checksum. When one cannot be written (a full disk), a warning says
+    so, the ones before stay, and training goes on. SIGINT and SIGTERM write one more and end ``learn`` as if its steps were
+    done; a second SIGINT interrupts at once.
+
+    :param folder: Where the files ``checkpoint_<environment steps>.safetensors`` go
+    :param save_freq: Environment steps between two of them
+    :param keep: How many of the newest stay
+    :param verbose: 1 prints a line for each
+    :raises ValueError: If ``save_freq`` or ``keep`` is less than 1
+    """
+
+    def __init__(self, folder: str | Path, save_freq: int = 100_000, keep: int = 2, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        for name, value in (("save_freq", save_freq), ("keep", keep)):
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        self.folder, self.save_freq, self.keep = Path(folder), save_freq, keep
+        self.all_callbacks: BaseCallback = self
+        self._last = 0
+        self._signal: int | None = None
+        self._stopped = False
+
+    def _on_training_start(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._last, self._signal, self._stopped = self.model.num_timesteps, None, False
+        self.all_callbacks = self.locals.get("callback", self)
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, self._note_signal)  # ``learn`` puts back what was there
+
+    def _note_signal(self, number: int, frame: Any) -> None:
+        if self._signal is not None and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self._signal = number
+        print(f"{signal.Signals(number).name}: training ends with a checkpoint after this step")
+
+    def _on_rollout_start(self) -> None:
+        # Here everything that belongs to the steps so far has been done
+        due = self.num_timesteps // self.save_freq > self._last // self.save_freq
+        if due or self._signal is not None:
+            self.save()
+            self._last = self.num_timesteps
+        self._stopped = self._signal is not None
+
+    def _on_step(self) -> bool:
+        return not self._stopped
+
+    def _on_training_end(self) -> None:
+        if not self._stopped and self.num_timesteps > self._last:
+            self.save()
+
+    def save(self) -> bool:
+        """
+        Write a checkpoint now.
+
+        :return: Whether it could be written
+        """
+        path = self.folder / f"checkpoint_{getattr(self.model, 'lifetime_steps', self.num_timesteps):012d}.safetensors"
+        try:
+            write_checkpoint(path, self.model, self.all_callbacks)
+        except OSError as error:
+            warnings.warn(f"No checkpoint at step {self.num_timesteps}: {error}. The ones before stay, training goes on")
+            return False
+        for old in checkpoint_files(self.folder)[self.keep :]:
+            old.unlink(missing_ok=True)
+        if self.verbose >= 1:
+            print(f"[checkpoint] {path}")
+        return True

@@ -1,0 +1,332 @@
+"""A model in plain values and arrays, and the same model made of them again: for ``export`` and a safe ``load``."""
+
+import inspect
+import warnings
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import TensorDict
+from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_ddiffpg.envs.snapshots import normalization, restore_normalization
+from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
+from sb3_ddiffpg.safe_files import check_array, convert
+
+Model = TypeVar("Model", bound=Any)
+
+#: What a file that holds a model says it is
+KIND = "model"
+# Of the constructor, but not the model's: given again when it is loaded
+GIVEN_AT_LOADING = {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}
+
+
+class _Space(msgspec.Struct, forbid_unknown_fields=True):
+    kind: str
+    dtype: str | None = None
+    low: np.ndarray | None = None
+    high: np.ndarray | None = None
+    n: list[int] | None = None
+    shape: list[int] | None = None
+    parts: dict[str, Any] | None = None
+
+
+class _Normalizer(msgspec.Struct, forbid_unknown_fields=True):
+    statistics: Any
+    settings: dict[str, Any]
+
+
+class ModelTree(msgspec.Struct, forbid_unknown_fields=True):
+    """What a file holds of a model."""
+
+    algorithm: str
+    policy: str | None
+    arguments: dict[str, Any]
+    observation_space: Any
+    action_space: Any
+    n_envs: int
+    state: dict[str, Any]
+    parameters: dict[str, dict[str, Any]]
+    normalizer: _Normalizer | None
+
+
+def constructor_arguments(algorithm: type) -> set[str]:
+    """
+    :param algorithm: A class whose constructor may hand ``**kwargs`` on to the one above it
+    :return: Names of all that it takes
+    """
+    arguments: set[str] = set()
+    for each in algorithm.__mro__:
+        if "__init__" in vars(each):
+            parameters = inspect.signature(vars(each)["__init__"]).parameters.values()
+            arguments |= {parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD}
+            if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+                break
+    return arguments - {"self"}
+
+
+def model_tree(model: Any, optimizers: bool = True) -> dict[str, Any]:
+    """
+    :param model: One of this package's algorithms
+    :param optimizers: Whether what the optimisers have gathered is part of it
+    :return: All that it is, without its replay buffer and environments
+    """
+    names = sorted(constructor_arguments(type(model)) - GIVEN_AT_LOADING)
+    # SB3 keeps one of them under another name
+    arguments = {name: to_plain(getattr(model, name if hasattr(model, name) else f"_{name}")) for name in names}
+    # What SB3 has made of it is no argument any more
+    frequency = model.train_freq
+    if hasattr(frequency, "unit"):
+        arguments["train_freq"] = to_plain((frequency.frequency, frequency.unit.value))
+    known = [name for name, policy in model.policy_aliases.items() if policy is model.policy_class]
+    normalizer = model.get_vec_normalize_env()
+    return {
+        "algorithm": type(model).__name__,
+        "policy": known[0] if known else None,
+        "arguments": arguments,
+        "observation_space": _space_tree(model.observation_space),
+        "action_space": _space_tree(model.action_space),
+        "n_envs": model.n_envs,
+        "state": model.state_tree(),
+        "parameters": {
+            name: _optimizer_tree(each, optimizers) if "param_groups" in each else dict(each)
+            for name, each in model.get_parameters().items()
+        },
+        "normalizer": None if normalizer is None else _normalizer_tree(normalizer),
+    }
+
+
+def build_model(
+    algorithm: type[Model],
+    tree: Any,
+    env: Any = None,
+    device: th.device | str = "auto",
+    custom_objects: dict[str, Any] | None = None,
+    **changes: Any,
+) -> Model:
+    """
+    :param algorithm: Of which class the model is
+    :param tree: What ``model_tree`` gave
+    :param env: To train on; None: the model only acts
+    :param device: Where it computes
+    :param custom_objects: Arguments that are code (a schedule, a policy class as ``"policy"``): no file holds them
+    :param changes: Other values of constructor arguments
+    :return: The model
+    :raises ValueError: If the tree is something else, is another algorithm's, does not fit ``env``, or needs code
+    """
+    saved = convert(tree, ModelTree, "model")
+    if saved.algorithm != algorithm.__name__:
+        raise ValueError(f"the file holds a {saved.algorithm[:50]}: load it with that class, not with {algorithm.__name__}")
+    accepted = constructor_arguments(algorithm) - GIVEN_AT_LOADING
+    unknown = (set(saved.arguments) | set(changes)) - accepted
+    if unknown:
+        raise ValueError(f"model.arguments: {sorted(unknown)} are no arguments of {algorithm.__name__}")
+    given = dict(custom_objects or {})
+    policy = given.pop("policy", saved.policy)
+    if policy is None:
+        raise ValueError("the policy is a class of one's own, which no file holds: give custom_objects={'policy': ...}")
+    arguments = {**_arguments(saved.arguments, {**given, **changes}), **given, **changes}
+    _check_sizes(arguments, saved.parameters)
+    observation_space, action_space = _space(saved.observation_space), _space(saved.action_space)
+    if env is not None:
+        env = algorithm._wrap_env(env, 0)
+        if saved.normalizer is not None:
+            env = _normalized(env, saved.normalizer)
+        check_for_correct_spaces(env, observation_space, action_space)
+    elif saved.normalizer is not None:
+        warnings.warn("The model was trained on normalised observations: give env=, which is then normalised alike")
+    try:
+        model = algorithm(policy=policy, env=env, device=device, _init_setup_model=False, **arguments)
+        model.observation_space, model.action_space = observation_space, action_space
+        model.n_envs = saved.n_envs if env is None else env.num_envs
+        model.load_state_tree(saved.state)
+        model._setup_model()
+        parameters = _parameters(model, saved.parameters)
+    except (TypeError, AttributeError, AssertionError, KeyError, IndexError, RuntimeError, OverflowError) as error:
+        raise ValueError(f"model: its arguments make no {algorithm.__name__}: {error!r}") from error
+    model.set_parameters(parameters, exact_match=True, device=model.device)
+    return model
+
+
+def _arguments(plain: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    arguments = {}
+    for name, each in plain.items():
+        if name in given:
+            continue
+        try:
+            arguments[name] = from_plain(each)
+        except NeededError as needed:
+            raise ValueError(
+                f"{name} is code ({needed}), which no file holds: give custom_objects={{{name!r}: ...}}"
+            ) from None
+        except ValueError as error:
+            raise ValueError(f"model.arguments.{name}: {error}") from None
+    return arguments
+
+
+def _check_sizes(arguments: dict[str, Any], parameters: dict[str, dict[str, Any]]) -> None:
+    """Networks cannot be larger than what is there to fill them: a small file must not ask for all of the memory."""
+    total = sum(each.size for part in parameters.values() for each in part.values() if isinstance(each, np.ndarray))
+    sizes: list[int] = []
+
+    def collect(value: Any) -> None:
+        if isinstance(value, dict):
+            for each in value.values():
+                collect(each)
+        elif isinstance(value, (list, tuple)):
+            numbers = [each for each in value if isinstance(each, int)]
+            sizes.extend(first * second for first, second in pairwise(numbers))
+            for each in value:
+                collect(each)
+        elif isinstance(value, int):
+            sizes.append(value)
+
+    names = (
+        "policy_kwargs",
+        "novelty_kwargs",
+        "n_critics",
+        "n_atoms",
+        "n_diffusion_steps",
+        "mode_embedding_dim",
+        "latent_dim",
+    )
+    for name in names:
+        collect(arguments.get(name))
+    critics = arguments.get("n_critics", 1)
+    if sizes and max(sizes) * (critics if isinstance(critics, int) else 1) > 64 * total + 2**20:
+        raise ValueError(f"model.arguments: networks of {max(sizes)} for a file of {total} parameters")
+
+
+# ------------------------------------------------------------------ spaces
+
+
+def _space_tree(space: spaces.Space) -> dict[str, Any]:
+    kind = type(space).__name__
+    match space:
+        case spaces.Box():
+            return {"kind": kind, "dtype": str(space.dtype), "low": space.low, "high": space.high}
+        case spaces.Discrete():
+            return {"kind": kind, "n": [int(space.n), int(space.start)]}
+        case spaces.MultiDiscrete() if space.nvec.ndim == 1:
+            return {"kind": kind, "n": space.nvec.tolist()}
+        case spaces.MultiBinary():
+            return {"kind": kind, "shape": list(space.shape), "n": [space.n] if isinstance(space.n, int) else None}
+        case spaces.Dict():
+            return {"kind": kind, "parts": {key: _space_tree(each) for key, each in space.spaces.items()}}
+    raise TypeError(f"A space of kind {kind} cannot be exported")
+
+
+def _space(tree: Any) -> Any:
+    saved = convert(tree, _Space, "space")
+    try:
+        match saved:
+            case _Space(kind="Box", low=np.ndarray() as low, high=np.ndarray() as high, dtype=str(dtype)):
+                if low.shape != high.shape or np.dtype(dtype).kind not in "biuf":
+                    raise ValueError(f"bounds of shapes {low.shape} and {high.shape}, of {dtype}")
+                return spaces.Box(low, high, dtype=np.dtype(dtype).type)
+            case _Space(kind="Discrete", n=[n, start]):
+                return spaces.Discrete(n, start=start)
+            case _Space(kind="MultiDiscrete", n=[_, *_] as sizes):
+                return spaces.MultiDiscrete(sizes)
+            case _Space(kind="MultiBinary", shape=[_, *_] as shape) if np.prod(shape, dtype=float) < 2**31:
+                return spaces.MultiBinary(shape if saved.n is None else shape[0])
+            case _Space(kind="Dict", parts=dict(parts)):
+                return spaces.Dict({key: _space(each) for key, each in parts.items()})
+    except (AssertionError, TypeError, OverflowError, ValueError) as error:
+        raise ValueError(f"space: {error}") from None
+    raise ValueError(f"space: {saved.kind[:50]!r} of this form is unknown")
+
+
+# ------------------------------------------------------------------ parameters
+
+
+def _optimizer_tree(state: dict[str, Any], complete: bool) -> dict[str, Any]:
+    return {
+        "state": {str(index): each for index, each in state["state"].items()} if complete else {},
+        "groups": [{key: to_plain(value) for key, value in group.items()} for group in state["param_groups"]],
+    }
+
+
+def _parameters(model: Any, trees: dict[str, dict[str, Any]]) -> dict[str, TensorDict]:
+    """As SB3's ``set_parameters`` wants them, and fitting the model."""
+    expected = model.get_parameters()
+    if set(trees) != set(expected):
+        raise ValueError(f"model.parameters: of {sorted(trees)}, {type(model).__name__} has {sorted(expected)}")
+    found: dict[str, Any] = {}
+    for name, own in expected.items():
+        if "param_groups" in own:
+            optimizer = model
+            for part in name.split("."):
+                optimizer = getattr(optimizer, part)
+            found[name] = _optimizer(optimizer, own, trees[name], f"model.parameters.{name}")
+            continue
+        if set(trees[name]) != set(own):
+            raise ValueError(f"model.parameters.{name}: {sorted(set(trees[name]) ^ set(own))} are there or are missing")
+        found[name] = {key: _tensor(trees[name][key], value, f"model.parameters.{name}.{key}") for key, value in own.items()}
+    return found
+
+
+def _tensor(array: Any, like: th.Tensor, what: str) -> th.Tensor:
+    array = convert(array, np.ndarray, what)
+    return th.from_numpy(check_array(array, _numpy_dtype(like), list(like.shape), what).copy())
+
+
+def _numpy_dtype(tensor: th.Tensor) -> np.dtype:
+    return th.zeros((), dtype=tensor.dtype).numpy().dtype
+
+
+def _optimizer(optimizer: th.optim.Optimizer, own: dict[str, Any], tree: dict[str, Any], what: str) -> dict[str, Any]:
+    saved = convert(tree, dict[str, Any], what)
+    states, groups = (convert(saved.get(key), kind, what) for key, kind in (("state", dict[str, Any]), ("groups", list[Any])))
+    parameters = [each for group in optimizer.param_groups for each in group["params"]]
+    if len(groups) != len(own["param_groups"]):
+        raise ValueError(f"{what}: {len(groups)} groups, the optimizer has {len(own['param_groups'])}")
+    restored = []
+    for group, before in zip(groups, own["param_groups"], strict=True):
+        values = {key: from_plain(value) for key, value in convert(group, dict[str, Any], what).items()}
+        if set(values) != set(before) or values["params"] != before["params"]:
+            raise ValueError(f"{what}: its settings are not those of a {type(optimizer).__name__}")
+        for key, value in values.items():
+            if isinstance(before[key], (float, bool, tuple)) and not isinstance(value, (type(before[key]), int)):
+                raise ValueError(f"{what}.{key}: {value!r} given, where {before[key]!r} was")
+        restored.append(values)
+    state: dict[int, dict[str, th.Tensor]] = {}
+    for index, each in states.items():
+        if not index.isdecimal() or int(index) >= len(parameters):
+            raise ValueError(f"{what}: {index[:20]!r} is none of its {len(parameters)} parameters")
+        shape, dtype = list(parameters[int(index)].shape), _numpy_dtype(parameters[int(index)])
+        arrays = {key: convert(array, np.ndarray, what) for key, array in convert(each, dict[str, Any], what).items()}
+        for key, array in arrays.items():
+            check_array(array, dtype if array.ndim else array.dtype, shape if array.ndim else [], f"{what}.{key}")
+        state[int(index)] = {key: th.from_numpy(array.copy()) for key, array in arrays.items()}
+    return {"state": state, "param_groups": restored}
+
+
+# ------------------------------------------------------------------ normalisation
+
+_NORMALIZER_SETTINGS = ("norm_obs", "norm_reward", "clip_obs", "clip_reward", "gamma", "epsilon", "norm_obs_keys")
+
+
+def _normalizer_tree(env: VecNormalize) -> dict[str, Any]:
+    settings = {name: to_plain(getattr(env, name)) for name in _NORMALIZER_SETTINGS}
+    return {"statistics": normalization(env), "settings": settings}
+
+
+def _normalized(env: Any, saved: _Normalizer) -> VecNormalize:
+    """The environments, normalised as those of the model were."""
+    settings = {name: from_plain(value) for name, value in saved.settings.items()}
+    if set(settings) != set(_NORMALIZER_SETTINGS):
+        raise ValueError(f"model.normalizer: settings {sorted(settings)} given; accepted are {sorted(_NORMALIZER_SETTINGS)}")
+    for name in ("clip_obs", "clip_reward", "gamma", "epsilon"):
+        convert(settings[name], float, f"model.normalizer.{name}")
+    if not isinstance(env, VecNormalize):
+        try:
+            env = VecNormalize(env, **settings)
+        except (TypeError, ValueError, AssertionError, KeyError) as error:
+            raise ValueError(f"model.normalizer: {error}") from None
+    restore_normalization(env, saved.statistics)
+    return env

@@ -1,0 +1,195 @@
+"""How an algorithm is saved, shared, loaded and resumed."""
+
+import contextlib
+import io
+import pathlib
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Any, ClassVar, TypeVar
+
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_ddiffpg.checkpoints import InterruptedRun, read_checkpoint
+from sb3_ddiffpg.model_file import KIND, build_model, model_tree
+from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
+from sb3_ddiffpg.safe_files import convert, read, write
+from sb3_ddiffpg.visits import VisitMap
+
+SelfSavable = TypeVar("SelfSavable", bound="SavableAlgorithm")
+
+
+class SavableAlgorithm(OffPolicyAlgorithm):
+    """
+    An ``OffPolicyAlgorithm`` that can be exported without code and resumed in the middle of a run.
+
+    A subclass names its counters in ``_counters``, hands further records on in ``state_tree`` and ``load_state_tree``, and
+    what drives running episodes in ``episodes_tree`` and ``load_episodes_tree``.
+    """
+
+    visits: VisitMap | None
+    _resolved_features: Any
+    _interrupted: InterruptedRun | None = None
+    #: Attributes that are plain values, and their types
+    _counters: ClassVar[dict[str, Any]] = {
+        "num_timesteps": int,
+        "_total_timesteps": int,
+        "_num_timesteps_at_start": int,
+        "_episode_num": int,
+        "_n_updates": int,
+        "_current_progress_remaining": float,
+        "env_spec": str | None,
+        "is_normalized": bool,
+        "_warned_support": bool,
+        "_warned_cut_values": bool,
+    }
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+        optimizers: bool = True,
+    ) -> None:
+        """
+        See SB3.
+
+        :param path: Path to the file
+        :param exclude: Attributes to leave out
+        :param include: Attributes to save though they are usually left out
+        :param optimizers: Whether what the optimisers have gathered is saved; without it the file is half as large, and
+            training that goes on from it begins with fresh ones
+        """
+        attributes = (recursive_getattr(self, name) for name in self._get_torch_save_params()[0])
+        left_out = [each for each in attributes if isinstance(each, th.optim.Optimizer) and not optimizers]
+        states = [optimizer.state for optimizer in left_out]
+        try:
+            for optimizer in left_out:
+                optimizer.state = defaultdict(dict)
+            super().save(path, exclude, include)
+        finally:
+            for optimizer, state in zip(left_out, states, strict=True):
+                optimizer.state = state
+
+    @classmethod
+    def load(
+        cls: type[SelfSavable],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        safe: bool = False,
+        **kwargs: Any,
+    ) -> SelfSavable:
+        """
+        See SB3. **A .zip file runs code that it holds when it is loaded: load only those whose maker you trust.**
+        ``safe=True`` reads what ``export`` wrote, which cannot run anything.
+
+        :param path: Path to the file
+        :param env: To train on; None: the model only acts
+        :param device: Device on which the model computes
+        :param custom_objects: Replacements for what cannot be loaded; of a safe file, the arguments that are code
+        :param print_system_info: Whether to print the system that a .zip was saved on, and this one
+        :param force_reset: Whether the environments are reset before training
+        :param safe: Whether the file is one that ``export`` wrote
+        :param kwargs: Other values of constructor arguments
+        :return: The model
+        :raises ValueError: If ``safe`` and the file is something else or damaged, or does not fit
+        """
+        if safe:
+            tree = read(pathlib.Path(path), KIND)  # type: ignore[arg-type]
+            return build_model(cls, tree, env, device, custom_objects, **kwargs)
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    def export(self, path: str | pathlib.Path, optimizers: bool = False) -> None:
+        """
+        Save the model without code, for ``load(path, safe=True)``: weights and settings in one safetensors file.
+
+        :param path: Path to the file
+        :param optimizers: Whether what the optimisers have gathered goes with it, so that training goes on smoothly
+        :raises OSError: If the file cannot be written; what was there before still is
+        """
+        write(pathlib.Path(path), KIND, model_tree(self, optimizers))
+
+    @classmethod
+    def resume(
+        cls: type[SelfSavable],
+        path: str | pathlib.Path,
+        env: GymEnv,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> SelfSavable:
+        """
+        Go on with a run from what a ``RunCheckpointCallback`` wrote: ``model.learn(model.remaining_timesteps,
+        reset_num_timesteps=False)`` with the same callbacks does what the run would have done, bit for bit on a CPU where the
+        environments can be saved (those of this package can; others begin new episodes).
+
+        :param path: Of a checkpoint, or of the folder, of which the newest is taken that is whole
+        :param env: Made as the run's
+        :param device: Device on which the model computes
+        :param custom_objects: Arguments that are code: no checkpoint holds them
+        :param kwargs: Other values of constructor arguments
+        :return: The model
+        :raises FileNotFoundError: If there is no checkpoint
+        :raises ValueError: If none is whole, or it does not fit
+        """
+        _, checkpoint = read_checkpoint(path)
+        model = build_model(cls, checkpoint.model, env, device, custom_objects, **kwargs)
+        model._interrupted = InterruptedRun(checkpoint.run)
+        model._interrupted.restore_buffer_and_environments(model)
+        return model
+
+    @property
+    def remaining_timesteps(self) -> int:
+        """Steps that the latest ``learn`` has not done yet."""
+        return max(0, self._total_timesteps - self.num_timesteps)
+
+    def state_tree(self) -> dict[str, Any]:
+        """
+        :return: Numbers and records beside the networks, in plain values and arrays
+        """
+        return {
+            "counters": {name: getattr(self, name) for name in self._all_counters()},
+            "mode_features": to_plain(self._resolved_features),
+            "visits": None if self.visits is None else self.visits.state_dict(),
+        }
+
+    def load_state_tree(self, tree: Any) -> None:
+        """
+        :param tree: What ``state_tree`` gave
+        :raises ValueError: If it is something else
+        """
+        counters = convert(tree.get("counters"), dict[str, Any], "model.state.counters")
+        known = self._all_counters()
+        if set(counters) != set(known):
+            raise ValueError(f"model.state.counters: {sorted(counters)} given; accepted are {sorted(known)}")
+        for name, kind in known.items():
+            setattr(self, name, convert(counters[name], kind, f"model.state.counters.{name}"))
+        with contextlib.suppress(NeededError):  # then the constructor's argument says it
+            self._resolved_features = from_plain(tree.get("mode_features"))
+        visits = tree.get("visits")
+        self.visits = None if visits is None else VisitMap.from_state(visits)
+
+    @classmethod
+    def _all_counters(cls) -> dict[str, Any]:
+        return {name: kind for each in cls.__mro__ for name, kind in vars(each).get("_counters", {}).items()}
+
+    def episodes_tree(self) -> dict[str, Any]:
+        """
+        :return: What drives the episodes in progress
+        """
+        return {}
+
+    def load_episodes_tree(self, tree: dict[str, Any]) -> None:
+        """
+        :param tree: What ``episodes_tree`` gave
+        :raises ValueError: If it is something else
+        """
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_interrupted"]

@@ -1,0 +1,168 @@
+"""One file without code: plain values as JSON and arrays, in the safetensors format. Reading it runs nothing that it holds."""
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch as th
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+FORMAT = "sb3_ddiffpg"
+#: Counted up when a file means something else than before
+VERSION = 1
+# Key of the one-entry dict that stands in the JSON for an array
+_ARRAY = "$array"
+# Deeper than anything that we write, and shallow enough for every reader
+_DEEPEST = 50
+
+
+def write(path: Path, kind: str, tree: Any) -> None:
+    """
+    Write a file so that at any moment the old one or the whole new one is there.
+
+    :param path: Of the file
+    :param kind: What it is, such as ``"model"``
+    :param tree: None, bools, numbers, strings, arrays and tensors, in lists, tuples (which come back as lists) and dicts
+    :raises TypeError: If something else is in it, saying where
+    :raises OSError: If it cannot be written, such as on a full disk; what was there before still is
+    """
+    arrays: dict[str, np.ndarray] = {}
+    text = json.dumps(_pack(tree, "", arrays))
+    metadata = {"format": FORMAT, "version": str(VERSION), "kind": kind, "tree": text, "sha256": _digest(kind, text, arrays)}
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        save_file(arrays, unfinished, metadata)
+        with unfinished.open("rb") as file:
+            os.fsync(file.fileno())
+        os.replace(unfinished, path)
+    except SafetensorError as error:  # it says so for whatever the system refuses
+        number = errno.ENOSPC if "os error 28" in str(error) else errno.EIO
+        raise OSError(number, f"{os.strerror(number)} ({error})", str(path)) from None
+    finally:
+        with contextlib.suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+    _sync_folder(path.parent)
+
+
+def read(path: Path, kind: str) -> Any:
+    """
+    :param path: Of a file that ``write`` has written
+    :param kind: What it must be
+    :return: What was written, arrays in place of tensors
+    :raises FileNotFoundError: If there is none
+    :raises ValueError: If it is something else, of a later version, or damaged
+    """
+    if not path.is_file():
+        raise FileNotFoundError(errno.ENOENT, "There is no such file", str(path))
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != FORMAT:
+                raise ValueError(f"{path} is no file of {FORMAT}")
+            if metadata.get("version") != str(VERSION):
+                raise ValueError(f"{path} is of version {metadata.get('version')!r}; this {FORMAT} reads version {VERSION}")
+            if metadata.get("kind") != kind:
+                raise ValueError(f"{path} holds a {metadata.get('kind')!r}, not a {kind!r}")
+            arrays = {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, OSError, TypeError, KeyError, MemoryError) as error:
+        raise ValueError(f"{path} is damaged, or no file of {FORMAT}: {error}") from None
+    text = metadata.get("tree", "")
+    if metadata.get("sha256") != _digest(kind, text, arrays):
+        raise ValueError(f"{path} is damaged: its contents do not fit their checksum")
+    try:
+        return _unpack(json.loads(text), arrays)
+    except (ValueError, RecursionError, KeyError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from None
+
+
+def convert(tree: Any, schema: Any, what: str) -> Any:
+    """
+    :param tree: As read from a file
+    :param schema: What it must be: a type as ``msgspec`` knows them, with ``np.ndarray`` for arrays
+    :param what: Its name, for the message
+    :return: The same as the schema wants it
+    :raises ValueError: If it is something else, saying where
+    """
+    try:
+        return msgspec.convert(tree, schema)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise ValueError(f"{what}: {error}") from None
+
+
+def check_array(array: np.ndarray, dtype: Any, shape: Sequence[int | None], what: str) -> np.ndarray:
+    """
+    :param array: As read from a file
+    :param dtype: What its numbers must be
+    :param shape: Its shape, None where any size will do
+    :param what: Its name, for the message
+    :return: The array
+    :raises ValueError: If it is another
+    """
+    fits = len(array.shape) == len(shape) and all(want in (None, got) for want, got in zip(shape, array.shape, strict=True))
+    if array.dtype != np.dtype(dtype) or not fits:
+        accepted = f"{np.dtype(dtype)} of shape {['any' if size is None else size for size in shape]}"
+        raise ValueError(f"{what}: {array.dtype} of shape {list(array.shape)} given; accepted is {accepted}")
+    return array
+
+
+def _pack(tree: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
+    """What JSON holds of a tree; arrays go into ``arrays`` under their place."""
+    if tree is None or isinstance(tree, (bool, int, float, str)):
+        return tree
+    if isinstance(tree, np.generic):
+        return tree.item()
+    if isinstance(tree, th.Tensor):
+        tree = tree.detach().cpu().numpy()
+    if isinstance(tree, np.ndarray):
+        if tree.dtype.kind not in "biuf" or not tree.dtype.isnative:
+            raise TypeError(f"{place}: an array of {tree.dtype} cannot be saved")
+        arrays[place] = tree.copy(order="C")
+        return {_ARRAY: place}
+    if isinstance(tree, Mapping):
+        for key in tree:
+            if not isinstance(key, str) or key.startswith("$"):
+                raise TypeError(f"{place}: keys must be strings without '$' in front, got {key!r}")
+        return {key: _pack(value, f"{place}/{key}", arrays) for key, value in tree.items()}
+    if isinstance(tree, Sequence):
+        return [_pack(value, f"{place}/{i}", arrays) for i, value in enumerate(tree)]
+    raise TypeError(f"{place}: {tree!r} of {type(tree)} cannot be saved")
+
+
+def _unpack(packed: Any, arrays: dict[str, np.ndarray], depth: int = 0) -> Any:
+    if depth > _DEEPEST:
+        raise ValueError(f"more than {_DEEPEST} lists and dicts in one another")
+    if isinstance(packed, list):
+        return [_unpack(each, arrays, depth + 1) for each in packed]
+    if isinstance(packed, dict):
+        if set(packed) == {_ARRAY}:
+            return arrays[str(packed[_ARRAY])]
+        return {key: _unpack(each, arrays, depth + 1) for key, each in packed.items()}
+    return packed
+
+
+def _digest(kind: str, text: str, arrays: dict[str, np.ndarray]) -> str:
+    """Checksum of all that a file holds."""
+    digest = hashlib.sha256(f"{kind}\0{text}".encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"\0{name}\0{array.dtype.str}\0{array.shape}\0".encode())
+        digest.update(array.reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Let the new name survive a loss of power, where the system can."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,344 @@
+"""Files without code: what goes in comes out, and nothing that comes from a stranger is run."""
+
+import json
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+import torch as th
+from environments import AnySpaces, TwoEnds, assert_same_state, image_dict_space, small_model, some_observations, state_of
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from safetensors.numpy import load_file, save_file
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.baselines import BASELINES
+from sb3_ddiffpg.model_file import build_model, model_tree
+from sb3_ddiffpg.plain_values import from_plain, to_plain
+from sb3_ddiffpg.safe_files import read, write
+from sb3_ddiffpg.schedules import LateLinearSchedule
+
+PLAIN = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
+ARRAYS = hnp.arrays(
+    st.sampled_from([np.float32, np.float64, np.int32, np.int64, np.uint8, bool]), hnp.array_shapes(min_dims=0)
+)
+KEYS = st.text().filter(lambda key: not key.startswith("$"))
+TREES = st.recursive(PLAIN | ARRAYS, lambda each: st.lists(each, max_size=4) | st.dictionaries(KEYS, each, max_size=4))
+
+
+def assert_same_tree(first, second):
+    assert type(first) is type(second)
+    if isinstance(first, dict):
+        assert list(first) == list(second)
+        first, second = list(first.values()), list(second.values())
+    if isinstance(first, list):
+        assert len(first) == len(second)
+        for one, other in zip(first, second, strict=True):
+            assert_same_tree(one, other)
+    elif isinstance(first, np.ndarray):
+        assert first.dtype == second.dtype and first.shape == second.shape and first.tobytes() == second.tobytes()
+    else:
+        assert first == second
+
+
+@given(tree=TREES)
+@settings(max_examples=100, deadline=None)
+def test_what_goes_in_comes_out(tmp_path_factory, tree):
+    path = tmp_path_factory.mktemp("tree") / "file"
+    write(path, "thing", tree)
+    assert_same_tree(read(path, "thing"), tree)
+
+
+def test_only_plain_values_go_in(tmp_path):
+    for bad, place in (({"a": [1, {2}]}, "/a/1"), ({"a": {1: 2}}, "/a"), ({"$array": "x"}, ""), ([np.array(["x"])], "/0")):
+        with pytest.raises(TypeError, match=f"^{place}: "):
+            write(tmp_path / "file", "thing", bad)
+    assert not list(tmp_path.iterdir())
+
+
+@given(data=st.data())
+@settings(max_examples=100, deadline=None)
+def test_one_changed_byte_is_found(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("tree") / "file"
+    write(path, "thing", {"numbers": np.arange(5), "word": "abc"})
+    raw = bytearray(path.read_bytes())
+    place = data.draw(st.integers(0, len(raw) - 1))
+    raw[place] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(raw)
+    with pytest.raises(ValueError, match="file"):
+        read(path, "thing")
+
+
+@given(raw=st.binary(max_size=200))
+@settings(max_examples=100, deadline=None)
+def test_any_bytes(tmp_path_factory, raw):
+    path = tmp_path_factory.mktemp("tree") / "file"
+    path.write_bytes(raw)
+    with pytest.raises(ValueError, match="damaged"):
+        read(path, "thing")
+
+
+def test_what_it_says_it_is(tmp_path):
+    path = tmp_path / "file"
+    write(path, "thing", [1])
+    with pytest.raises(ValueError, match="holds a 'thing', not a 'model'"):
+        read(path, "model")
+    save_file({"x": np.zeros(3)}, path)
+    with pytest.raises(ValueError, match="no file of sb3_ddiffpg"):
+        read(path, "thing")
+    save_file({"x": np.zeros(3)}, path, {"format": "sb3_ddiffpg", "version": "7"})
+    with pytest.raises(ValueError, match="of version '7'; this sb3_ddiffpg reads version 1"):
+        read(path, "thing")
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        read(tmp_path / "nowhere", "thing")
+
+
+# ------------------------------------------------------------------ models
+
+
+def test_exported_models_act_the_same(trained, tmp_path):
+    path = tmp_path / "model.safetensors"
+    trained.export(path)
+    loaded = DDiffPG.load(path, safe=True)
+    for mode in (None, *trained.modes.names):
+        expected = trained.predict(some_observations(), deterministic=True, mode=mode)[0]
+        np.testing.assert_array_equal(loaded.predict(some_observations(), deterministic=True, mode=mode)[0], expected)
+    assert str(loaded.modes) == str(trained.modes) and str(loaded.mode_history) == str(trained.mode_history)
+    assert [mode.outcomes for mode in loaded.modes] == [mode.outcomes for mode in trained.modes]
+    assert loaded.visits._counts == trained.visits._counts if trained.visits else loaded.visits is None
+    assert loaded.get_env() is None and loaded.num_timesteps == trained.num_timesteps
+    loaded = DDiffPG.load(path, env=DummyVecEnv([TwoEnds] * 2), safe=True, batch_size=16)
+    assert loaded.batch_size == 16
+    loaded.learn(60)
+
+
+def test_with_optimizers_training_goes_on_the_same(trained, tmp_path):
+    trained.export(tmp_path / "half")
+    trained.export(tmp_path / "whole", optimizers=True)
+    trained.save(tmp_path / "zip")
+    assert_same_state(state_of(DDiffPG.load(tmp_path / "whole", safe=True)), state_of(DDiffPG.load(tmp_path / "zip")))
+    assert (tmp_path / "half").stat().st_size < 0.7 * (tmp_path / "whole").stat().st_size
+
+
+@pytest.mark.parametrize("name", sorted(BASELINES))
+def test_baselines(tmp_path, name):
+    env = DummyVecEnv([TwoEnds] * 2)
+    model = BASELINES[name]("MlpPolicy", env, learning_starts=10, policy_kwargs={"net_arch": [8]}, seed=0)
+    model.learn(40)
+    model.export(tmp_path / "model", optimizers=True)
+    loaded = BASELINES[name].load(tmp_path / "model", safe=True)
+    assert_same_state(state_of(loaded), state_of(model))
+    with pytest.raises(ValueError, match=f"holds a {type(model).__name__}: load it with that class, not with DDiffPG"):
+        DDiffPG.load(tmp_path / "model", safe=True)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(-1, 1, (3,), dtype=np.float64),
+        spaces.Box(np.array([-np.inf, 0.0]), np.array([1.0, np.inf])),
+        spaces.Discrete(5),
+        spaces.MultiDiscrete([2, 3]),
+        spaces.MultiBinary(3),
+        image_dict_space(),
+    ],
+    ids=lambda space: type(space).__name__,
+)
+def test_spaces(space, tmp_path):
+    policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"
+    model = small_model(DummyVecEnv([lambda: AnySpaces(space)]), policy)
+    model.export(tmp_path / "model")
+    loaded = DDiffPG.load(tmp_path / "model", safe=True)
+    assert loaded.observation_space == model.observation_space and loaded.action_space == model.action_space
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        DDiffPG.load(tmp_path / "model", env=DummyVecEnv([lambda: AnySpaces(spaces.Box(-5, 5, (9,)))]), safe=True)
+
+
+def test_normalised_observations(tmp_path):
+    env = VecNormalize(DummyVecEnv([TwoEnds] * 2), norm_reward=False, clip_obs=7.0)
+    model = small_model(env)
+    model.learn(80)
+    model.export(tmp_path / "model")
+    loaded = DDiffPG.load(tmp_path / "model", env=DummyVecEnv([TwoEnds] * 2), safe=True)
+    normalizer = loaded.get_vec_normalize_env()
+    assert normalizer.clip_obs == 7.0 and not normalizer.norm_reward
+    for name in ("mean", "var", "count"):
+        np.testing.assert_array_equal(getattr(normalizer.obs_rms, name), getattr(env.obs_rms, name))
+    with pytest.warns(UserWarning, match="normalised observations: give env="):
+        DDiffPG.load(tmp_path / "model", safe=True)
+
+
+def test_schedules_and_noise(tmp_path):
+    noise = NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
+    schedules = {"learning_rate": LateLinearSchedule(1e-3), "qf_learning_rate": LinearSchedule(1e-3, 1e-4, 0.5)}
+    model = small_model(DummyVecEnv([TwoEnds]), action_noise=noise, **schedules)
+    model.export(tmp_path / "model")
+    loaded = DDiffPG.load(tmp_path / "model", safe=True)
+    for progress in (1.0, 0.4, 0.0):
+        assert loaded.lr_schedule(progress) == model.lr_schedule(progress)
+        assert loaded._qf_schedule(progress) == model._qf_schedule(progress)
+    np.testing.assert_array_equal(loaded.action_noise._sigma, noise._sigma)
+
+
+def test_code_is_given_again(tmp_path):
+    def rate(progress):
+        return 1e-3 * progress
+
+    model = small_model(DummyVecEnv([TwoEnds]), learning_rate=rate)
+    model.export(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"learning_rate is code .*custom_objects={'learning_rate': ...}"):
+        DDiffPG.load(tmp_path / "model", safe=True)
+    loaded = DDiffPG.load(tmp_path / "model", safe=True, custom_objects={"learning_rate": rate})
+    assert loaded.lr_schedule(0.5) == 5e-4
+
+
+# ------------------------------------------------------------------ strangers
+
+RAN = []
+
+
+def evil():
+    RAN.append("evil")
+
+
+class Evil:
+    def __reduce__(self):
+        return evil, ()
+
+
+def evil_zip(trained, path):
+    """SB3's own format with code in a field of ``data``."""
+    trained.save(path)
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    data = json.loads(parts["data"])
+    data["learning_rate"] = {":type:": "Evil", ":serialized:": __import__("base64").b64encode(pickle.dumps(Evil())).decode()}
+    parts["data"] = json.dumps(data).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, part in parts.items():
+            archive.writestr(name, part)
+
+
+def test_code_in_a_zip_a_buffer_or_a_normalizer_is_not_run(trained, tmp_path):
+    """SB3's three ways in (its issue 2281). That they are ways in is shown as well."""
+    evil_zip(trained, tmp_path / "model.zip")
+    (tmp_path / "buffer.pkl").write_bytes(pickle.dumps(Evil()))
+    (tmp_path / "vecnormalize.pkl").write_bytes(pickle.dumps(Evil()))
+    for path in sorted(tmp_path.iterdir()):
+        with pytest.raises(ValueError, match="damaged, or no file"):
+            DDiffPG.load(path, safe=True)
+        with pytest.raises(ValueError, match="damaged, or no file"):
+            DDiffPG.resume(path, DummyVecEnv([TwoEnds] * 4))
+    assert not RAN
+    with pytest.raises(Exception):  # noqa: B017 - whatever it trips over, it has run by then
+        DDiffPG.load(tmp_path / "model.zip")
+    assert RAN == ["evil"]
+    RAN.clear()
+
+
+def test_names_of_other_classes_are_refused(trained, tmp_path):
+    for value in (
+        {"class": "os.system"},
+        {"class": "torch.load"},
+        {"class": "torch.nn.Module"},
+        {"class": "sb3_ddiffpg.noise.np"},
+        {"object": "subprocess.Popen", "state": {"args": "ls"}},
+        {"object": "torch.nn.ReLU", "state": {}},
+        {"object": "sb3_ddiffpg.schedules.LateLinearSchedule", "state": {"__class__": 1}},
+        {"object": "sb3_ddiffpg.schedules.LateLinearSchedule", "state": {"__call__": 1}},
+        {"other": 1},
+        {"tuple": [1], "class": "torch.nn.ReLU"},
+    ):
+        with pytest.raises(ValueError, match="no value that is saved here|may name|no attribute"):
+            from_plain(value)
+        tree = model_tree(trained)
+        tree["arguments"]["policy_kwargs"] = {"dict": {"activation_fn": value}}
+        with pytest.raises(ValueError, match="policy_kwargs"):
+            build_model(DDiffPG, tree)
+
+
+@given(value=st.recursive(PLAIN, lambda each: st.lists(each) | st.tuples(each, each) | st.dictionaries(KEYS, each)))
+@settings(max_examples=100, deadline=None)
+def test_plain_arguments(value):
+    assert from_plain(to_plain(value)) == value
+
+
+def mutate(tree, data):
+    """Put something else into a random place of a tree."""
+    places = []
+
+    def walk(node):
+        entries = list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else []
+        for key in entries:
+            places.append((node, key))
+            walk(node[key])
+
+    walk(tree)
+    node, key = places[data.draw(st.integers(0, len(places) - 1))]
+    before = node[key]
+    other = st.sampled_from([None, True, -1, 0, 10**12, 2**70, float("nan"), 1e300, "", "x", [], {}, np.zeros(3, np.float32)])
+    if isinstance(before, np.ndarray) and before.size:
+        other |= st.sampled_from(
+            [before.ravel()[:0], before.astype(np.float64), before[None], before * 0 - 1, np.full_like(before, 1)]
+        )
+    new = data.draw(other)
+    if data.draw(st.booleans()) and isinstance(node, dict):
+        node.pop(key)
+    else:
+        node[key] = new
+
+
+@given(data=st.data())
+@settings(max_examples=60, deadline=None)
+def test_a_changed_model_is_a_model_or_a_clear_error(trained, data):
+    tree = read_back(trained)
+    mutate(tree, data)
+    try:
+        model = build_model(DDiffPG, tree)
+    except ValueError as error:
+        assert str(error)
+        return
+    model.predict(np.zeros((2, 2), dtype=np.float32))
+
+
+def read_back(model):
+    """As a file holds it, in lists and dicts that may be changed."""
+    tree = model_tree(model)
+
+    def copy(node):
+        if isinstance(node, dict):
+            return {key: copy(each) for key, each in node.items()}
+        if isinstance(node, (list, tuple)):
+            return [copy(each) for each in node]
+        return node.detach().numpy().copy() if isinstance(node, th.Tensor) else node
+
+    return copy(tree)
+
+
+def test_a_small_file_cannot_ask_for_all_of_the_memory(trained):
+    for name, value in (
+        ("policy_kwargs", {"dict": {"net_arch": [10**6, 10**6]}}),
+        ("policy_kwargs", {"dict": {"net_arch": [10**12]}}),
+        ("n_atoms", 10**12),
+        ("n_critics", 10**12),
+        ("mode_embedding_dim", 10**12),
+        ("novelty_kwargs", {"dict": {"net_arch": {"tuple": [10**6, 10**6]}}}),
+    ):
+        tree = read_back(trained)
+        tree["arguments"][name] = value
+        with pytest.raises(ValueError, match="networks of"):
+            build_model(DDiffPG, tree)
+
+
+def test_the_file_is_readable_by_others(trained, tmp_path):
+    """Weights and settings are where safetensors and JSON put them."""
+    trained.export(tmp_path / "model.safetensors")
+    arrays = load_file(tmp_path / "model.safetensors")
+    embeddings = arrays["/parameters/policy/mode_embeddings"]
+    np.testing.assert_array_equal(embeddings[1:], [mode.embedding for mode in trained.modes])
