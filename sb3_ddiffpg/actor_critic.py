@@ -206,10 +206,13 @@ class NoveltyActorCritic(SavableAlgorithm):
     def _buffer_arguments(self) -> dict[str, Any]:
         """What they say about the replay buffer."""
         arguments = {"mode_features": self._resolved_features, "success_key": self.success_key}
-        if self.episodic_novelty:
-            cell_size = VisitCounts.default_cell_size if self.novelty == "counts" else declared_cell_size(self.env)
-            arguments["visit_cell_size"] = (self.novelty_kwargs or {}).get("cell_size", cell_size)
-        return arguments
+        return {**arguments, **({"visit_cell_size": self._visit_cell_size()} if self.episodic_novelty else {})}
+
+    def _visit_cell_size(self) -> float:
+        """Edge of the cells by which places are told apart."""
+        if self.novelty == "counts":
+            return float((self.novelty_kwargs or {}).get("cell_size", VisitCounts.default_cell_size))
+        return declared_cell_size(self.env)
 
     def _check_arguments(self) -> None:
         check_arguments(self, self._policy_arguments)
@@ -326,9 +329,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         inputs = [self._novelty_inputs(obs) for obs in self.replay_buffer.read_observations(windows[present])]
         now, then = (self.novelty_model.novelty(*each) for each in inputs)
         reward = noveld_reward(now, then, self.novelty_scale)
-        if self.episodic_novelty:
-            first = self.replay_buffer.first_visits[windows[present]]
-            reward = reward * th.from_numpy(first).to(self.device, non_blocking=True)
+        reward = reward * self._pays(windows, present, inputs[1][0])
         metrics["intrinsic_reward"].append(reward.mean())
         if self.normalize_intrinsic:
             self.intrinsic_moments.update(reward[:, None])
@@ -347,6 +348,19 @@ class NoveltyActorCritic(SavableAlgorithm):
             rewards[1:] -= ordinary * modes_present
         discounts = self.gamma ** th.arange(windows.shape[-1], device=self.device)
         return self.intrinsic_coef * (rewards * discounts).sum(dim=-1).float()
+
+    def _pays(self, windows: np.ndarray, present: np.ndarray, positions: th.Tensor) -> th.Tensor:
+        """
+        Where novelty is paid.
+
+        :param windows: Rows, [G, n, n_steps]
+        :param present: Which of them there are, same shape
+        :param positions: Reached by each that is present, [N, position_dim]
+        :return: Shape [N]
+        """
+        # All of them in a buffer that does not tell
+        first = self.replay_buffer.first_visits[windows[present]]
+        return th.from_numpy(first).to(self.device, non_blocking=True)
 
     def _novelty_inputs(self, obs: Any) -> tuple[th.Tensor, th.Tensor]:
         """Positions [N, position_dim] and scaled features [N, features_dim] of observations, not normalised, on the device."""
@@ -452,8 +466,12 @@ class NoveltyActorCritic(SavableAlgorithm):
         progress_bar: bool = False,
     ) -> SelfActorCritic:
         """
-        Train the model. See SB3's ``learn``; ``log_interval`` counts episodes of all environments.
+        Train the model. See SB3's ``learn``; ``log_interval`` counts episodes of all environments. The first call after
+        ``resume`` is given what the interrupted one was given, and does what was left of it.
         """
+        if self._interrupted is not None:
+            done = self.num_timesteps - (0 if reset_num_timesteps else self._num_timesteps_at_start)
+            total_timesteps, reset_num_timesteps = max(0, total_timesteps - done), False
         # Denormal numbers in Adam's moments slow a small update down by half
         th.set_flush_denormal(True)
         try:

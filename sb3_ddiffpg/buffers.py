@@ -396,6 +396,13 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         new_ways = [trajectory.rows for trajectory in stays if self.way_novelty[trajectory.rows[-1]] > 0]
         self._new_way_rows = np.concatenate([self._new_way_rows[:0], *new_ways])
 
+    def mode_success_rows(self) -> np.ndarray:
+        """
+        :return: Rows of the goal-reached trajectories that train a mode by its own way, shape [N]
+        """
+        training = [each.rows for each in self.trajectories(success=True) if each.trains]
+        return np.concatenate([np.empty(0, dtype=np.int32), *training])
+
     def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:
         """
         A mode's trajectories, and apart from them the detours: successes that nobody told to follow the mode and that are

@@ -17,6 +17,7 @@ from sb3_ddiffpg.episodes import run_episodes
 from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
 from sb3_ddiffpg.history import ModeEvent
 from sb3_ddiffpg.rng import preserved_rng
+from sb3_ddiffpg.safe_files import convert
 from sb3_ddiffpg.trajectories import read_success
 
 
@@ -107,9 +108,26 @@ class _PeriodicCallback(BaseCallback):
             raise ValueError(f"{name} must be at least 1, got {period}")
         self._period = period
         self._next = 0
+        self._resumed = False
 
     def _on_training_start(self) -> None:
-        self._next = self.model.num_timesteps + self._period
+        if not self._resumed:
+            self._next = self.model.num_timesteps + self._period
+        self._resumed = False
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: What a resumed run must know, for ``load_state_dict``
+        """
+        return {"next": self._next}
+
+    def load_state_dict(self, state: Any) -> None:
+        """
+        :param state: What ``state_dict`` gave
+        :raises ValueError: If it is something else
+        """
+        self._next = convert(state.get("next"), int, "callback.next")
+        self._resumed = True
 
     def _on_step(self) -> bool:
         return True
@@ -164,6 +182,30 @@ class EvaluateModesCallback(_PeriodicCallback):
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
 
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: What a resumed run must know, for ``load_state_dict``
+        """
+        evaluations = [[step, found.to_dict()] for step, found in self.evaluations]
+        return {**super().state_dict(), "best": list(self._best), "best_step": self.best_step, "evaluations": evaluations}
+
+    def load_state_dict(self, state: Any) -> None:
+        """
+        :param state: What ``state_dict`` gave
+        :raises ValueError: If it is something else
+        """
+        super().load_state_dict(state)
+        self._best = convert(state.get("best"), tuple[float, float], "callback.best")
+        self.best_step = convert(state.get("best_step"), int | None, "callback.best_step")
+        evaluations = convert(state.get("evaluations"), list[tuple[int, dict[str, Any]]], "callback.evaluations")
+        self.evaluations = [(step, ModeEvaluation.from_dict(each)) for step, each in evaluations]
+        if self.path is not None:  # what was written after the checkpoint is about to be done again
+            self.path.write_text("".join(self._line(*each) for each in self.evaluations))
+
+    @staticmethod
+    def _line(step: int, found: ModeEvaluation) -> str:
+        return json.dumps({"step": step, **found.to_dict()}) + "\n"
+
     def _on_period(self) -> None:
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
@@ -185,7 +227,7 @@ class EvaluateModesCallback(_PeriodicCallback):
         self.logger.dump(self.num_timesteps)
         if self.path is not None:
             with self.path.open("a") as file:
-                file.write(json.dumps({"step": self.num_timesteps, **found.to_dict()}) + "\n")
+                file.write(self._line(self.num_timesteps, found))
         score = (found.commanded_modes, found.uncommanded.success_rate)
         if self.best_model_path is not None and score > self._best:
             unfinished = self.best_model_path.with_name(f".{self.best_model_path.stem}.zip")

@@ -21,6 +21,8 @@ from sb3_ddiffpg.safe_files import convert, read, write
 
 #: What the file says it is
 KIND = "checkpoint"
+# What SB3's EvalCallback has gathered, and writes anew to its file each time
+_EVALUATIONS = ("evaluations_timesteps", "evaluations_results", "evaluations_length", "evaluations_successes")
 
 
 class _Callback(msgspec.Struct, forbid_unknown_fields=True):
@@ -162,6 +164,7 @@ def _callback_state(callback: BaseCallback) -> dict[str, Any]:
     state: dict[str, Any] = {"n_calls": callback.n_calls}
     if isinstance(callback, EvalCallback):
         state["best_mean_reward"] = float(callback.best_mean_reward)
+        state.update({name: getattr(callback, name) for name in _EVALUATIONS})
     if hasattr(callback, "state_dict"):
         state["own"] = callback.state_dict()
     return state
@@ -171,6 +174,8 @@ def _load_callback_state(callback: BaseCallback, state: dict[str, Any]) -> None:
     callback.n_calls = convert(state.get("n_calls"), int, "callback.n_calls")
     if isinstance(callback, EvalCallback) and "best_mean_reward" in state:
         callback.best_mean_reward = convert(state["best_mean_reward"], float, "callback.best_mean_reward")
+        for name in _EVALUATIONS:
+            getattr(callback, name).extend(convert(state.get(name), list[Any], f"callback.{name}"))
     if hasattr(callback, "load_state_dict") and "own" in state:
         callback.load_state_dict(state["own"])
 

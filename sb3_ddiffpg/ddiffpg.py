@@ -21,7 +21,8 @@ from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, Behavior
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.callbacks import ClusteringCallback, contains_clustering
 from sb3_ddiffpg.features import same_selection
-from sb3_ddiffpg.history import ModeHistory
+from sb3_ddiffpg.history import ModeEvent, ModeHistory
+from sb3_ddiffpg.intrinsic import KnownPlaces
 from sb3_ddiffpg.mode_control import ModeControl
 from sb3_ddiffpg.modes import Mode, ModeTable, Outcome, default_name, modes_from_state, modes_state
 from sb3_ddiffpg.policies import DiffusionActor, DiffusionPolicy
@@ -113,6 +114,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation
     :param episodic_novelty: Whether a place pays only when it is reached for the first time in an episode (Zhang et al., 2021,
         section 3): otherwise explorers stand where fewest have been
+    :param explore_off_modes: Whether explorers are paid nothing for places where the trajectories go that train the modes, so
+        that another way pays where it leaves the known ones, not only where it ends
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
     :param max_grad_norm: Largest gradient norm of the policy and of each mode's critics
@@ -199,6 +202,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         new_way_coef: float = 0.0,
         normalize_intrinsic: bool = True,
         episodic_novelty: bool = True,
+        explore_off_modes: bool = True,
         reset_new_critics: bool = True,
         max_grad_norm: float = 1.0,
         control: str | None = None,
@@ -276,6 +280,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         self.exploration_fraction = exploration_fraction
         self.explore_then_exploit = explore_then_exploit
         self.explore_beyond_goals = explore_beyond_goals
+        self.explore_off_modes = explore_off_modes
         self.mode_intrinsic_coef = mode_intrinsic_coef
         self.new_way_coef = new_way_coef
         self.reset_new_critics = reset_new_critics
@@ -324,6 +329,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        self.known_places = KnownPlaces(self.replay_buffer.features.dim, self._visit_cell_size()).to(self.device)
         self.replay_buffer.expect_modes(len(self._modes))
 
     def _resolve_mode_features(self) -> None:
@@ -369,6 +375,27 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             rewards = rewards + self.mode_intrinsic_coef * intrinsic
         rewards[EXPLORATORY_GROUP] = intrinsic[EXPLORATORY_GROUP] + self.new_way_coef * self.reward_scale * batch.new_ways
         return rewards
+
+    def _pays(self, windows: np.ndarray, present: np.ndarray, positions: th.Tensor) -> th.Tensor:
+        pays = super()._pays(windows, present, positions)
+        if self.explore_off_modes and self._modes:
+            # What a mode knows is not new, or explorers would follow it to what lies beyond
+            explores = th.from_numpy(np.nonzero(present)[0] == EXPLORATORY_GROUP).to(self.device, non_blocking=True)
+            pays = pays & ~(explores & self.known_places.contain(positions))
+        return pays
+
+    def recluster(self) -> list[ModeEvent]:
+        """
+        See ``ModeControl``. From now on the places where the modes' trajectories go are known.
+
+        :return: What happened: births, splits, merges and retirements
+        """
+        events = super().recluster()
+        if self.explore_off_modes and self._modes:
+            rows = self.replay_buffer.mode_success_rows()
+            reached = self.replay_buffer.read_observations(rows)[1]
+            self.known_places.replace(self.replay_buffer.features.of_tensors(reached))
+        return events
 
     def _row_embeddings(self, batch: ModeBatch, masked: bool) -> th.Tensor:
         """Embedding of every row's group, [G * n, mode_embedding_dim]; masked with probability p, exploration never."""
@@ -489,6 +516,10 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         return super()._init_callback(callbacks, progress_bar)
 
     # ------------------------------------------------------------------ saving
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names, variables = super()._get_torch_save_params()
+        return [*names, "known_places"], variables
 
     def state_tree(self) -> dict[str, Any]:
         """

@@ -235,9 +235,20 @@ class ModeEvaluation:
         :return: The evaluation
         :raises ValueError: If it is no such file
         """
-        data = json.loads(Path(path).read_text())
+        try:
+            return ModeEvaluation.from_dict(json.loads(Path(path).read_text()))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise ValueError(f"{path} is no evaluation of modes: {error!r}") from None
+
+    @staticmethod
+    def from_dict(data: Any) -> "ModeEvaluation":
+        """
+        :param data: What :meth:`to_dict` gave
+        :return: The evaluation
+        :raises ValueError: If it is of another format
+        """
         if not isinstance(data, dict) or data.get("format") != _FORMAT:
-            raise ValueError(f"{path} is no evaluation of modes in format {_FORMAT}")
+            raise ValueError(f"it is not of format {_FORMAT}")
 
         def command(row: dict[str, Any]) -> CommandResult:
             return CommandResult(**{**row, "mean_length": _nan(row["mean_length"]), "mean_return": _nan(row["mean_return"])})

@@ -145,10 +145,66 @@ class RandomNetworkDistillation(nn.Module):
         return loss.detach()
 
 
+class HashedCells(nn.Module):
+    """
+    Cells of a grid without bounds, hashed into a table of fixed size, so that the map's extent need not be known.
+
+    :param dim: Number of coordinates
+    :param cell_size: Edge of a cell, in their unit
+    :param table_size: Number of entries of the table
+    """
+
+    def __init__(self, dim: int, cell_size: float, table_size: int = 2**16) -> None:
+        super().__init__()
+        self.cell_size, self.table_size = cell_size, table_size
+        # Fixed odd multipliers: the same cell must hash to the same entry in every process
+        multipliers = np.random.default_rng(0).integers(1, 2**31, size=dim, dtype=np.int64) * 2 + 1
+        self.multipliers: th.Tensor
+        self.register_buffer("multipliers", th.as_tensor(multipliers), persistent=False)
+
+    def entries(self, positions: th.Tensor) -> th.Tensor:
+        """
+        :param positions: Shape [N, dim]
+        :return: Entry of the table of every position, shape [N]
+        """
+        cells = (positions / self.cell_size).floor().long()
+        mixed = (cells * self.multipliers).sum(dim=-1)
+        return (mixed ^ (mixed >> 21)) % self.table_size
+
+
+class KnownPlaces(nn.Module):
+    """
+    A set of cells, see ``HashedCells``.
+
+    :param dim: Number of coordinates
+    :param cell_size: Edge of a cell, in their unit
+    """
+
+    known: th.Tensor
+
+    def __init__(self, dim: int, cell_size: float) -> None:
+        super().__init__()
+        self.cells = HashedCells(dim, cell_size)
+        self.register_buffer("known", th.zeros(self.cells.table_size, dtype=th.bool))
+
+    def replace(self, positions: th.Tensor) -> None:
+        """
+        :param positions: In the cells that are known from now on, shape [N, dim]
+        """
+        self.known.zero_()
+        self.known[self.cells.entries(positions)] = True
+
+    def contain(self, positions: th.Tensor) -> th.Tensor:
+        """
+        :param positions: Shape [N, dim]
+        :return: Whether their cells are known, shape [N]
+        """
+        return self.known[self.cells.entries(positions)]
+
+
 class VisitCounts(nn.Module):
     """
-    Novelty as ``1 / sqrt(1 + n)``, n the visits of the position's cell (Bellemare et al., 2016). Cells are found by hashing
-    into a table of fixed size, so that the map's extent need not be known.
+    Novelty as ``1 / sqrt(1 + n)``, n the visits of the position's cell (Bellemare et al., 2016), see ``HashedCells``.
 
     :param position_dim: Size of the position features
     :param observation_dim: Not used: counting needs few dimensions
@@ -167,19 +223,9 @@ class VisitCounts(nn.Module):
             raise ValueError(f"novelty_kwargs['cell_size'] must be positive, got {cell_size}")
         if table_size < 1:
             raise ValueError(f"novelty_kwargs['table_size'] must be at least 1, got {table_size}")
-        self.cell_size = cell_size
+        self.cells = HashedCells(position_dim, cell_size, table_size)
         self.register_buffer("counts", th.zeros(table_size))
-        # Fixed odd multipliers: the same cell must hash to the same entry in every process
-        multipliers = np.random.default_rng(0).integers(1, 2**31, size=position_dim, dtype=np.int64) * 2 + 1
-        self.multipliers: th.Tensor
-        self.register_buffer("multipliers", th.as_tensor(multipliers), persistent=False)
         self.optimizer: th.optim.Optimizer | None = None
-
-    def _entries(self, positions: th.Tensor) -> th.Tensor:
-        """Entry of the table of every position, shape [N]."""
-        cells = (positions / self.cell_size).floor().long()
-        mixed = (cells * self.multipliers).sum(dim=-1)
-        return (mixed ^ (mixed >> 21)) % self.counts.shape[0]
 
     @th.no_grad()
     def observe(self, positions: th.Tensor) -> None:
@@ -188,7 +234,7 @@ class VisitCounts(nn.Module):
 
         :param positions: Shape [N, position_dim]
         """
-        entries = self._entries(positions)
+        entries = self.cells.entries(positions)
         self.counts.index_add_(0, entries, th.ones_like(entries, dtype=self.counts.dtype))
 
     @th.no_grad()
@@ -198,7 +244,7 @@ class VisitCounts(nn.Module):
         :param observations: Not used
         :return: Shape [N]
         """
-        return (1 + self.counts[self._entries(positions)]).rsqrt()
+        return (1 + self.counts[self.cells.entries(positions)]).rsqrt()
 
     def update(self, positions: th.Tensor, observations: th.Tensor) -> th.Tensor:
         """

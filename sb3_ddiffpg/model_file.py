@@ -122,7 +122,7 @@ def build_model(
     if saved.algorithm != algorithm.__name__:
         raise ValueError(f"the file holds a {saved.algorithm[:50]}: load it with that class, not with {algorithm.__name__}")
     accepted = constructor_arguments(algorithm) - GIVEN_AT_LOADING
-    unknown = (set(saved.arguments) | set(changes)) - accepted
+    unknown = (set(saved.arguments) | set(changes) - {"tensorboard_log"}) - accepted
     if unknown:
         raise ValueError(f"model.arguments: {sorted(unknown)} are no arguments of {algorithm.__name__}")
     given = dict(custom_objects or {})

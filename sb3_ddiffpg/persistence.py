@@ -119,15 +119,15 @@ class SavableAlgorithm(OffPolicyAlgorithm):
     def resume(
         cls: type[SelfSavable],
         path: str | pathlib.Path,
-        env: GymEnv,
+        env: GymEnv | None,
         device: th.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> SelfSavable:
         """
-        Go on with a run from what a ``RunCheckpointCallback`` wrote: ``model.learn(model.remaining_timesteps,
-        reset_num_timesteps=False)`` with the same callbacks does what the run would have done, bit for bit on a CPU where the
-        environments can be saved (those of this package can; others begin new episodes).
+        Go on with a run from what a ``RunCheckpointCallback`` wrote: the same ``learn`` with the same callbacks does what was
+        left of it, bit for bit on a CPU where the environments can be saved (those of this package can; others begin new
+        episodes).
 
         :param path: Of a checkpoint, or of the folder, of which the newest is taken that is whole
         :param env: Made as the run's
@@ -143,11 +143,6 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         model._interrupted = InterruptedRun(checkpoint.run)
         model._interrupted.restore_buffer_and_environments(model)
         return model
-
-    @property
-    def remaining_timesteps(self) -> int:
-        """Steps that the latest ``learn`` has not done yet."""
-        return max(0, self._total_timesteps - self.num_timesteps)
 
     def state_tree(self) -> dict[str, Any]:
         """

@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.callbacks import ModeEvalCallback
+from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.schedules import LateLinearSchedule
@@ -41,6 +42,8 @@ except ImportError as error:
     raise ImportError(f"the RL zoo is an extra ({error}); install it with: pip install 'sb3_ddiffpg[zoo]'") from error
 
 ALGO = "ddiffpg"
+# Environment steps between two checkpoints, unless --checkpoint-freq says otherwise
+CHECKPOINT_FREQ = 100_000
 
 # Keys of the zoo's YAML files that its ExperimentManager takes out before it calls the algorithm
 ZOO_KEYS = {
@@ -120,10 +123,15 @@ class ModeExperimentManager(ExperimentManager):
     package's algorithms with sampled actions: a deterministic evaluation would show one mode only.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, checkpoint_freq: int = 0, resume: Path | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        if self.algo == ALGO or self.algo in BASELINES:
+        self.checkpoint_freq, self.resume = checkpoint_freq, resume
+        self.is_own = self.algo == ALGO or self.algo in BASELINES
+        if self.is_own:
             self.deterministic_eval = False
+        if resume is not None:
+            self.save_path = str(resume)
+            self.params_path = f"{resume}/{self.env_name}"
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         check_hyperparameters(self.algo, list(hyperparams))
@@ -148,9 +156,30 @@ class ModeExperimentManager(ExperimentManager):
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         model = super()._load_pretrained_agent(hyperparams, env)
         # The zoo counts steps from zero again; with a full buffer the random warm-up would only do harm
-        if (self.algo == ALGO or self.algo in BASELINES) and model.replay_buffer.size() > 0:  # type: ignore[attr-defined]
+        if self.is_own and model.replay_buffer.size() > 0:  # type: ignore[attr-defined]
             model.learning_starts = 0  # type: ignore[attr-defined]
         return model
+
+    def create_callbacks(self) -> None:
+        """The zoo's, and checkpoints of the whole run."""
+        super().create_callbacks()
+        if self.is_own and self.checkpoint_freq > 0 and not self.optimize_hyperparameters:
+            folder = Path(self.save_path) / "checkpoints"
+            self.callbacks.append(RunCheckpointCallback(folder, self.checkpoint_freq, verbose=self.verbose))
+
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        """
+        :return: The model, new or from a checkpoint, and its hyperparameters
+        """
+        prepared = super().setup_experiment()
+        if self.resume is None or prepared is None:
+            return prepared
+        model, hyperparams = prepared
+        resumed = type(model).resume(  # type: ignore[attr-defined]
+            self.resume / "checkpoints", model.get_env(), verbose=self.verbose, tensorboard_log=self.tensorboard_log
+        )
+        print(f"Going on at step {resumed.num_timesteps} of {self.n_timesteps}")
+        return resumed, hyperparams
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """
@@ -164,7 +193,9 @@ class ModeExperimentManager(ExperimentManager):
         if not is_ours(env_id) or wrapped or self.vec_env_class is SubprocVecEnv:
             return super().create_envs(n_envs, eval_env, no_log)
         env_kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
-        monitor_file = None if eval_env or no_log else os.path.join(self.save_path, "0")
+        # A run that goes on must not lose what it has noted
+        n_before = len(list(Path(self.save_path).glob("*.monitor.csv")))
+        monitor_file = None if eval_env or no_log else os.path.join(self.save_path, str(n_before))
         env = make_vec_env(env_id, n_envs, seed=self.seed, **env_kwargs)
         if isinstance(env, VecMonitor):  # it writes no file
             env = env.venv
@@ -267,7 +298,9 @@ def commanded_to(mode: str | int) -> type[DDiffPG]:
 
 def train(arguments: Sequence[str]) -> None:
     """
-    The zoo's training script. Takes ``--n-envs`` beside its options, and as ``--conf-file`` also the name of a file of ours.
+    The zoo's training script. Beside its options it takes ``--n-envs N``, as ``--conf-file`` also the name of a file of ours,
+    ``--checkpoint-freq STEPS`` (0: no checkpoints), and ``--resume [FOLDER]``, which goes on with the newest run of this
+    algorithm and environment, or with the one in the folder.
 
     :param arguments: Command line, without the name of the program
     """
@@ -275,6 +308,9 @@ def train(arguments: Sequence[str]) -> None:
     parser.add_argument("--n-envs", type=int)
     parser.add_argument("-conf", "--conf-file")
     parser.add_argument("-params", "--hyperparams", nargs="+", default=[])
+    parser.add_argument("-f", "--log-folder", default="logs")
+    parser.add_argument("--checkpoint-freq", type=int, default=CHECKPOINT_FREQ)
+    parser.add_argument("--resume", nargs="?", const="")
     known, rest = _read(parser, arguments)
     hyperparams = [*known.hyperparams, *([] if known.n_envs is None else [f"n_envs:{known.n_envs}"])]
     if hyperparams:
@@ -283,8 +319,30 @@ def train(arguments: Sequence[str]) -> None:
     if path is not None and not Path(path).is_file() and not _is_module(str(path)):
         ours = sorted(each.stem for each in config_file(ALGO).parent.glob("*.yml"))  # type: ignore[union-attr]
         raise SystemExit(f"--conf-file: {known.conf_file!r} given; accepted are a YAML or Python file, a module, and {ours}")
-    with _command_line([*([] if path is None else ["--conf-file", str(path)]), *rest]):
-        rl_zoo3.train.train()
+    resume = None if known.resume is None else _run_folder(known.resume, known.log_folder, known.algo, known.env)
+    manager = partial(ModeExperimentManager, checkpoint_freq=known.checkpoint_freq, resume=resume)
+    rest += ["--log-folder", known.log_folder]
+    try:
+        rl_zoo3.train.ExperimentManager = manager  # type: ignore[assignment, misc]
+        with _command_line([*([] if path is None else ["--conf-file", str(path)]), *rest]):
+            rl_zoo3.train.train()
+    finally:
+        rl_zoo3.train.ExperimentManager = ModeExperimentManager  # type: ignore[misc]
+
+
+def _run_folder(given: str, log_folder: str, algo: str, env_id: str | None) -> Path:
+    """The run that ``--resume`` means."""
+    if given:
+        folder = Path(given)
+    else:
+        runs = Path(log_folder, algo).glob(f"{(env_id or '').replace('/', '-')}_*/checkpoints")
+        numbered = [path.parent for path in runs if path.parent.name.rpartition("_")[2].isdecimal()]
+        if not numbered:
+            raise SystemExit(f"--resume: {log_folder}/{algo} holds no run of {env_id} with checkpoints")
+        folder = max(numbered, key=lambda path: int(path.name.rpartition("_")[2]))
+    if not checkpoint_files(folder / "checkpoints"):
+        raise SystemExit(f"--resume: {str(folder)!r} given; accepted is the folder of a run, with checkpoints/ in it")
+    return folder
 
 
 def _is_module(name: str) -> bool:
@@ -334,7 +392,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="ddiffpg",
         description="DDiffPG in the RL zoo.",
-        epilog="`ddiffpg COMMAND -h` lists the zoo's options. Beside them: train --n-envs N; enjoy and record_video --mode M.",
+        epilog="`ddiffpg COMMAND -h` lists the zoo's options. Beside them: train --n-envs N, "
+        "--checkpoint-freq STEPS, --resume [FOLDER]; enjoy and record_video --mode M.",
     )
     parser.add_argument("command", choices=list(COMMANDS))
     parser.add_argument("options", nargs=argparse.REMAINDER)

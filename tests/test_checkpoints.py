@@ -80,8 +80,8 @@ def assert_goes_on_the_same(make_env, folder, end=END, at=None, algorithm=DDiffP
         np.random.seed(99)
         th.manual_seed(99)
         model = silent(algorithm.resume(path, make_env()))
-        assert 0 < model.num_timesteps < end and model.remaining_timesteps == end - model.num_timesteps
-        model.learn(model.remaining_timesteps, reset_num_timesteps=False)
+        assert 0 < model.num_timesteps < end
+        model.learn(end)
         assert outcome(model) == expected
         assert_same_state(state_of(model), state)
         if algorithm is DDiffPG:
@@ -139,8 +139,7 @@ def test_environments_that_cannot_be_saved_begin_new_episodes(tmp_path):
     with pytest.warns(UserWarning, match="new episodes begin"):
         model = silent(DDiffPG.resume(tmp_path, env))
     assert model._last_obs is None
-    model.learn(100, reset_num_timesteps=False)
-    assert model.num_timesteps >= 300
+    assert model.learn(300).num_timesteps >= 300
 
 
 def test_a_broken_checkpoint_is_passed_over(tmp_path):
@@ -198,7 +197,7 @@ def test_signals_end_the_training_with_a_checkpoint(tmp_path, number):
     assert {each: signal.getsignal(each) for each in before} == before
     resumed = silent(DDiffPG.resume(tmp_path, known_ends()))
     assert 200 <= resumed.num_timesteps < 220
-    resumed.learn(resumed.remaining_timesteps, reset_num_timesteps=False)
+    resumed.learn(400)
     whole = model_for(known_ends())
     whole.learn(400)
     assert outcome(resumed) == outcome(whole)
@@ -216,6 +215,19 @@ def test_a_second_interrupt_is_not_patient(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         model.learn(400, callback=[Sends(), RunCheckpointCallback(tmp_path)])
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_learn_goes_on_where_it_was(tmp_path):
+    """The interrupted call is repeated as it was."""
+    whole = model_for(known_ends())
+    whole.learn(100)
+    whole.learn(200, callback=RunCheckpointCallback(tmp_path, save_freq=90, keep=9), reset_num_timesteps=False)
+    resumed = silent(DDiffPG.resume(checkpoint_files(tmp_path)[-1], known_ends()))
+    assert 100 < resumed.num_timesteps < 200
+    resumed.learn(200, reset_num_timesteps=False)
+    assert outcome(resumed) == outcome(whole)
+    resumed.learn(50, reset_num_timesteps=False)  # a call like any other
+    assert 350 <= resumed.num_timesteps < 370
 
 
 def test_only_the_newest_stay(tmp_path):

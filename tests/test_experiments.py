@@ -39,8 +39,41 @@ def test_a_run_leaves_its_record_and_can_be_repeated(monkeypatch, tmp_path):
     models = [DDiffPG.load(tmp_path / name / "model.zip") for name in "ab"]
     for mine, other in zip(*(model.policy.parameters() for model in models), strict=True):
         np.testing.assert_array_equal(mine.detach().numpy(), other.detach().numpy())
-    with pytest.raises(SystemExit, match="holds a run already"):
-        record(monkeypatch, tmp_path / "a", "--again", str(tmp_path / "b"))
+    with pytest.raises(SystemExit, match="holds another run already"):
+        record(monkeypatch, tmp_path / "a", "--env", "PointMazeV1-v0", "--seed", "6", "--override", SMALL)
+
+
+def test_a_run_that_was_killed_goes_on(monkeypatch, tmp_path):
+    """With the same command, to the same end; and a complete one is left alone."""
+    command = ("--env", "PointMazeV1-v0", "--override", SMALL)
+    whole = record(monkeypatch, tmp_path / "a", *command)
+    on_period = runs.CurveCallback._on_period
+
+    def dies(self):
+        on_period(self)
+        if len(self.rows) == 2:
+            raise KeyError("killed")
+
+    monkeypatch.setattr(runs.CurveCallback, "_on_period", dies)
+    with pytest.raises(KeyError, match="killed"):
+        record(monkeypatch, tmp_path / "b", *command)
+    monkeypatch.setattr(runs.CurveCallback, "_on_period", on_period)
+    assert "result" not in yaml.safe_load((tmp_path / "b" / "config.yml").read_text())
+    resumed = record(monkeypatch, tmp_path / "b", *command)
+    assert resumed["result"]["steps"] == whole["result"]["steps"] and resumed["result"]["complete"]
+    curves = []
+    for name in "ab":
+        with (tmp_path / name / "curve.csv").open() as file:
+            curves.append([{k: v for k, v in row.items() if "hours" not in k} for row in csv.DictReader(file)])
+        curves.append((tmp_path / name / "logs" / "evaluations.jsonl").read_text())
+    assert curves[:2] == curves[2:]
+    models = [DDiffPG.load(tmp_path / name / "logs" / "final_model.zip") for name in "ab"]
+    for mine, other in zip(*(model.policy.parameters() for model in models), strict=True):
+        np.testing.assert_array_equal(mine.detach().numpy(), other.detach().numpy())
+    before = (tmp_path / "b" / "model.zip").stat().st_mtime_ns
+    record(monkeypatch, tmp_path / "b", *command)
+    assert (tmp_path / "b" / "model.zip").stat().st_mtime_ns == before
+    assert sorted(path.name for path in (tmp_path / "b" / "logs").glob("*.monitor.csv")) == ["0.monitor.csv", "1.monitor.csv"]
 
 
 def test_settings_that_do_not_exist(monkeypatch, tmp_path):

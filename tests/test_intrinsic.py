@@ -143,15 +143,55 @@ def filled_model(**changes):
     return model
 
 
+def slow_first_visits(buffer, cell_size):
+    """Rows whose step led to a cell where the episode had not been, one trajectory after the other."""
+    first = set()
+    running = [rows[:length] for rows, length in zip(buffer._running, buffer._running_length, strict=True)]
+    finished = [each.rows for success in (True, False) for each in buffer.trajectories(success)]
+    for rows in (*running, *finished, *(each.rows for each in buffer._retired)):
+        seen = []
+        for row in rows:
+            cell = tuple(int(x // cell_size) for x in buffer.features(buffer.next_observations[row : row + 1])[0])
+            if cell not in seen:
+                seen.append(cell)
+                first.add(int(row))
+    return first
+
+
+def test_first_visits():
+    model = filled_model(novelty_kwargs={"cell_size": 0.3})
+    buffer = model.replay_buffer
+    stored = buffer._all.rows[: buffer.size()]
+    expected = slow_first_visits(buffer, 0.3)
+    assert {int(row) for row in stored if buffer.first_visits[row]} == expected
+    assert 0.2 < len(expected) / len(stored) < 0.9
+    all_pay = filled_model(episodic_novelty=False).replay_buffer
+    assert all_pay.first_visits[all_pay._all.rows[: all_pay.size()]].all()
+
+
+def test_standing_where_nobody_was_pays_once():
+    """An explorer that was paid for every step would stand at the place that fewest have seen."""
+    for episodic, paid in ((True, 1), (False, 6)):
+        model = small_model(DummyVecEnv([TwoEnds]), episodic_novelty=episodic, normalize_intrinsic=False)
+        place = np.zeros((1, 2), dtype=np.float32)
+        for step in range(6):
+            model.replay_buffer.add(place, place, np.zeros((1, 1)), np.zeros(1), np.array([step == 5]), [{}])
+        rows = model.replay_buffer._all.rows[:6]
+        rewards = model._intrinsic_rewards(rows.reshape(1, 6, 1), defaultdict(list))
+        assert (rewards > 0).sum() == paid
+
+
 def slow_intrinsic_reward(model, window, scale=1.0, ordinary=0.0):
-    """Discounted NovelD rewards of a window, row by row, less what is ordinary."""
+    """Discounted NovelD rewards of a window, row by row, where they are paid, less what is ordinary."""
     total = 0.0
+    first = slow_first_visits(model.replay_buffer, 0.5)
     for k, row in enumerate(window[window >= 0]):
         now, then = (
             model.novelty_model.novelty(*model._novelty_inputs(th.from_numpy(obs[row : row + 1]))).item()
             for obs in (model.replay_buffer.observations, model.replay_buffer.next_observations)
         )
-        total += model.gamma**k * (min(max(then - model.novelty_scale * now, 0.0) / scale, 10.0) - ordinary)
+        reward = max(then - model.novelty_scale * now, 0.0) * (int(row) in first)
+        total += model.gamma**k * (min(reward / scale, 10.0) - ordinary)
     return model.intrinsic_coef * total
 
 
@@ -189,7 +229,7 @@ def test_intrinsic_rewards_are_scaled_by_their_own_deviation():
         model.novelty_model.novelty(*model._novelty_inputs(obs)).numpy()
         for obs in model.replay_buffer.read_observations(present)
     )
-    rewards = np.maximum(then - 0.5 * now, 0.0)
+    rewards = np.maximum(then - 0.5 * now, 0.0) * model.replay_buffer.first_visits[present]
     metrics = defaultdict(list)
     given = model._intrinsic_rewards(batch.windows, metrics)
     assert model.intrinsic_moments.count.item() == len(present)

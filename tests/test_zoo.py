@@ -4,12 +4,14 @@ import argparse
 import inspect
 import re
 import runpy
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
 import gymnasium_robotics
+import numpy as np
 import optuna
 import pytest
 import yaml
@@ -27,7 +29,7 @@ from sb3_ddiffpg.zoo import ModeExperimentManager, check_hyperparameters, main
 ENV = "PointMazeV1-v0"
 # The goal is next to the start: random actions find it
 MAP = ["#####", "#.rg#", "#####"]
-ENV_KWARGS = ["--env-kwargs", f"maze_map:{MAP}", "start_noise:0"]
+ENV_KWARGS = ["--env-kwargs", f"maze_map:{MAP}", "start_noise:0", "max_episode_steps:50"]
 SMALL = {
     "learning_starts": 100,
     "batch_size": 32,
@@ -89,6 +91,41 @@ def test_resume(run, tmp_path):
     # the buffer came along, so that every step was one of the policy and was learnt from
     assert after.learning_starts == 0
     assert after.replay_buffer.size() * 4 > 800
+
+
+def test_a_killed_training_goes_on(tmp_path, monkeypatch):
+    """``train --resume`` ends as if nothing had happened, whether the run is named or not."""
+
+    def command(name, *options):
+        return [*("train", "--env", ENV, "-n", "800", "--n-envs", "4", "--seed", "1", "-f", str(tmp_path / name)), *options]
+
+    settings = [*ENV_KWARGS, *hyperparams(), "--checkpoint-freq", "200", "--eval-freq", "60", "--eval-episodes", "2"]
+    main(command("whole", *settings))
+    for options in (["--resume"], ["--resume", str(tmp_path / "killed" / "ddiffpg" / f"{ENV}_1")]):
+        learn = DDiffPG.train
+
+        def dies(self, *args, learn=learn, **kwargs):
+            learn(self, *args, **kwargs)
+            if self.num_timesteps >= 500:
+                raise RuntimeError("killed")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(DDiffPG, "train", dies)
+            with pytest.raises(RuntimeError, match="killed"):
+                main(command("killed", *settings))
+        main(command("killed", *settings, *options))
+        runs = [tmp_path / name / "ddiffpg" / f"{ENV}_1" for name in ("whole", "killed")]
+        models = [DDiffPG.load(folder / f"{ENV}.zip") for folder in runs]
+        assert models[0].num_timesteps == models[1].num_timesteps == 800
+        for mine, other in zip(*(model.policy.parameters() for model in models), strict=True):
+            np.testing.assert_array_equal(mine.detach().numpy(), other.detach().numpy())
+        evaluations = [np.load(folder / "evaluations.npz")["timesteps"].tolist() for folder in runs]
+        assert evaluations[0] == evaluations[1] and len(evaluations[0]) >= 3
+        shutil.rmtree(tmp_path / "killed")
+    with pytest.raises(SystemExit, match="holds no run of PointMazeV1-v0"):
+        main(command("nothing", "--resume"))
+    with pytest.raises(SystemExit, match="accepted is the folder of a run"):
+        main(command("nothing", "--resume", str(tmp_path)))
 
 
 def test_resuming_refuses_unknown_keys(run, tmp_path):

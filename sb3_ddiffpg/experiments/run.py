@@ -2,8 +2,9 @@
 One training run that leaves all that is needed to judge it and to do it again, in one folder: ``model.zip``,
 ``evaluation.json``, ``curve.csv`` and ``config.yml``.
 
-``python -m sb3_ddiffpg.experiments.run --env AntMazeV1-v0 --conf-file ddiffpg-cpu --seed 1 --out results/AntMazeV1-v0/seed1``,
-and to repeat a recorded one ``python -m sb3_ddiffpg.experiments.run --again results/AntMazeV1-v0/seed1 --out DIR``.
+``python -m sb3_ddiffpg.experiments.run --env AntMazeV1-v0 --conf-file ddiffpg-cpu --seed 1 --out results/AntMazeV1-v0/seed1``;
+the same command goes on with a run that was killed, and ``python -m sb3_ddiffpg.experiments.run --again
+results/AntMazeV1-v0/seed1 --out DIR`` repeats a recorded one.
 """
 
 import argparse
@@ -29,15 +30,41 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.actor_critic import NoveltyActorCritic
 from sb3_ddiffpg.callbacks import EvaluateModesCallback
+from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.envs import is_ours
 from sb3_ddiffpg.evaluation import evaluate_modes
+from sb3_ddiffpg.persistence import SavableAlgorithm
+from sb3_ddiffpg.safe_files import convert
 from sb3_ddiffpg.trajectories import read_success
 from sb3_ddiffpg.zoo import ALGO, ALGOS, ModeExperimentManager, config_file, register
 
 # How often the modes are tested in training, as a share of the run, and in how many episodes for each command
 N_TESTS, N_TEST_EPISODES = 30, 20
+N_CHECKPOINTS = 30
 N_EPISODES = 100
 PACKAGES = ("sb3_ddiffpg", "stable_baselines3", "torch", "gymnasium", "mujoco", "pybullet", "numpy", "numba")
+
+
+class Clock:
+    """
+    Hours since a run began, without those between a kill and its resumption.
+
+    :param hours: So many before
+    :param cpu_hours: So many of all processors before
+    """
+
+    def __init__(self, hours: float = 0.0, cpu_hours: float = 0.0) -> None:
+        self._began, self._cpu = time.perf_counter() - 3600 * hours, time.process_time() - 3600 * cpu_hours
+
+    @property
+    def hours(self) -> float:
+        """Of the clock on the wall."""
+        return (time.perf_counter() - self._began) / 3600
+
+    @property
+    def cpu_hours(self) -> float:
+        """Of this process."""
+        return (time.process_time() - self._cpu) / 3600
 
 
 class CurveCallback(EvaluateModesCallback):
@@ -53,7 +80,8 @@ class CurveCallback(EvaluateModesCallback):
         self.folder = folder
         #: Goals reached in training, by the environment's label of the way
         self.reached: Counter[str] = Counter()
-        self._started, self._cpu = time.perf_counter(), time.process_time()
+        self.rows: list[dict[str, Any]] = []
+        self.clock = Clock()
 
     def _on_step(self) -> bool:
         for done, info in zip(self.locals["dones"], self.locals["infos"], strict=True):
@@ -70,8 +98,8 @@ class CurveCallback(EvaluateModesCallback):
         step, found = self.evaluations[-1]
         row: dict[str, Any] = {
             "step": step,
-            "hours": round((time.perf_counter() - self._started) / 3600, 4),
-            "cpu_hours": round((time.process_time() - self._cpu) / 3600, 4),
+            "hours": round(self.clock.hours, 4),
+            "cpu_hours": round(self.clock.cpu_hours, 4),
             "updates": self.model._n_updates,
             "cells": len(visits) if (visits := getattr(self.model, "visits", None)) is not None else "",
             "modes": len(getattr(self.model, "modes", ())),
@@ -84,13 +112,28 @@ class CurveCallback(EvaluateModesCallback):
             shares = [each.labels.get(label, 0) / each.n_episodes for each in (*found.commanded, found.uncommanded)]
             row[label] = round(max(shares), 3)
             row[f"reached {label}"] = self.reached[label]
-        path = self.folder / "curve.csv"
-        new = len(self.evaluations) == 1
-        with path.open("w" if new else "a", newline="") as file:
+        self.rows.append(row)
+        with (self.folder / "curve.csv").open("w", newline="") as file:
             writer = csv.DictWriter(file, list(row))
-            if new:
-                writer.writeheader()
-            writer.writerow(row)
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: What a resumed run must know, for ``load_state_dict``
+        """
+        clock = [self.clock.hours, self.clock.cpu_hours]
+        return {**super().state_dict(), "reached": dict(self.reached), "rows": self.rows, "clock": clock}
+
+    def load_state_dict(self, state: Any) -> None:
+        """
+        :param state: What ``state_dict`` gave
+        :raises ValueError: If it is something else
+        """
+        super().load_state_dict(state)
+        self.reached = Counter(convert(state.get("reached"), dict[str, int], "callback.reached"))
+        self.rows = convert(state.get("rows"), list[dict[str, Any]], "callback.rows")
+        self.clock = Clock(*convert(state.get("clock"), tuple[float, float], "callback.clock"))
 
 
 def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: Path) -> None:
@@ -101,10 +144,15 @@ def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: 
     :param env_id: Of the environment
     :param seed: Of the run
     :param hyperparams: As in an entry of the zoo's YAML files
-    :param folder: Where the record goes; must not hold another one
+    :param folder: Where the record goes. If it holds this run's beginning, that goes on; it must not hold another one
     """
-    if (folder / "config.yml").exists():
-        raise SystemExit(f"--out: {folder} holds a run already; accepted is a folder without one")
+    wanted = {"algo": algo, "env": env_id, "seed": seed, "hyperparams": hyperparams}
+    before = yaml.safe_load((folder / "config.yml").read_text()) if (folder / "config.yml").exists() else None
+    if before is not None and any(before.get(key) != value for key, value in wanted.items()):
+        raise SystemExit(f"--out: {folder} holds another run already; accepted is a folder without one, or with this one")
+    if before is not None and before.get("result", {}).get("complete"):
+        print(f"{folder} is complete")
+        return
     (folder / "logs").mkdir(parents=True, exist_ok=True)
     entry = folder / "logs" / "hyperparams.yml"
     entry.write_text(yaml.safe_dump({env_id: hyperparams}))
@@ -124,11 +172,11 @@ def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: 
     prepared = manager.setup_experiment()
     assert prepared is not None
     model = prepared[0]
+    checkpoints = folder / "logs" / "checkpoints"
+    if isinstance(model, SavableAlgorithm) and checkpoint_files(checkpoints):
+        model = type(model).resume(checkpoints, model.get_env(), verbose=model.verbose)
     record: dict[str, Any] = {
-        "algo": algo,
-        "env": env_id,
-        "seed": seed,
-        "hyperparams": hyperparams,
+        **wanted,
         "command": shlex.join(["python", "-m", "sb3_ddiffpg.experiments.run", *sys.argv[1:]]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "git_commit": _git_commit(),
@@ -142,19 +190,25 @@ def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: 
     curve = CurveCallback(
         folder, eval_env=test_env, eval_freq=max(1, manager.n_timesteps // N_TESTS), n_episodes=N_TEST_EPISODES
     )
-    manager.callbacks.insert(0, curve)  # the zoo tells the first one when it was interrupted
+    # The zoo tells the first one when it was interrupted
+    manager.callbacks.insert(0, curve)
+    if isinstance(model, SavableAlgorithm):
+        every = max(1, manager.n_timesteps // N_CHECKPOINTS)
+        manager.callbacks.append(RunCheckpointCallback(checkpoints, every))
     (folder / "config.yml").write_text(yaml.safe_dump(record, sort_keys=False))
-    started, cpu = time.perf_counter(), time.process_time()
     manager.learn(model)
     record["result"] = {
         "complete": model.num_timesteps >= manager.n_timesteps,
         "steps": model.num_timesteps,
         "updates": model._n_updates,
-        "hours": round((time.perf_counter() - started) / 3600, 3),
-        "cpu_hours": round((time.process_time() - cpu) / 3600, 3),
+        "hours": round(curve.clock.hours, 3),
+        "cpu_hours": round(curve.clock.cpu_hours, 3),
         "best_step": curve.best_step,
     }
     (folder / "config.yml").write_text(yaml.safe_dump(record, sort_keys=False))
+    if not record["result"]["complete"]:
+        test_env.close()
+        raise SystemExit(f"Stopped after {model.num_timesteps} of {manager.n_timesteps} steps; the same command goes on")
     model.save(folder / "logs" / "final_model.zip")
     if curve.best_step is None:
         shutil.copy(folder / "logs" / "final_model.zip", folder / "model.zip")
