@@ -88,8 +88,9 @@ def test_visit_counts_tell_the_cells_of_a_maze_apart():
     n_shared = counts.counts[counts.counts > 1].sum().item()
     assert n_shared < 1.2 * len(grid) * (1 - np.exp(-len(grid) / len(counts.counts)))
     # The same cell has the same entry in every process
-    assert VisitCounts(3, 0).multipliers.tolist() == VisitCounts(3, 0).multipliers.tolist()
-    assert VisitCounts(2, 0)._entries(th.tensor([[0.6, -3.2]])).tolist() == counts._entries(th.tensor([[0.9, -3.4]])).tolist()
+    assert VisitCounts(3, 0).cells.multipliers.tolist() == VisitCounts(3, 0).cells.multipliers.tolist()
+    other = VisitCounts(2, 0).cells
+    assert other.entries(th.tensor([[0.6, -3.2]])).tolist() == counts.cells.entries(th.tensor([[0.9, -3.4]])).tolist()
 
 
 def test_visit_counts_have_nothing_to_learn():
@@ -137,7 +138,7 @@ def test_distillation_error_is_the_distance_of_the_networks():
 
 def filled_model(**changes):
     """Two environments, some modes, and more in the buffer than there are visits to any place."""
-    model = small_model(DummyVecEnv([TwoEnds] * 4), **changes)
+    model = small_model(DummyVecEnv([TwoEnds] * 4), **({"explore_off_modes": False} | changes))
     model.learn(160)
     assert len(model.modes) >= 1
     return model
@@ -340,3 +341,37 @@ def test_each_episode_draws_its_noise():
     changes = (np.diff(deviations, axis=0) != 0).sum(axis=0)
     episodes = model._episode_num
     assert (changes >= episodes / 4).all() and changes.sum() <= episodes
+
+
+@pytest.mark.parametrize("explore_off_modes", [True, False])
+def test_where_modes_go_is_not_new_to_explorers(explore_off_modes):
+    """Told from the trajectories themselves: explorers are paid for none of the cells that those of the modes have reached."""
+    kwargs = {
+        "novelty_kwargs": {"cell_size": 0.05},
+        "episodic_novelty": False,
+        "novelty_scale": 0.0,
+        "normalize_intrinsic": False,
+    }
+    model = filled_model(explore_off_modes=explore_off_modes, **kwargs)
+    model.recluster()
+    buffer = model.replay_buffer
+    known = set()
+    for trajectory in buffer.trajectories(success=True):
+        if trajectory.trains:
+            known |= set(np.floor(buffer.full_path(trajectory)[1:, 0] / 0.05).astype(int).tolist())
+    stored = buffer._all.rows[: buffer.size()]
+    cells = np.floor(buffer.next_observations[stored, 0] / 0.05).astype(int)
+    on_modes = np.isin(cells, list(known))
+    assert 0.1 < on_modes.mean() < 0.95
+    rewards = model._intrinsic_rewards(np.stack([stored, stored])[:, :, None], defaultdict(list))
+    np.testing.assert_array_equal(rewards[0].numpy() > 0, ~on_modes if explore_off_modes else np.ones(len(stored), bool))
+    assert (rewards[1] > 0).all()  # the modes themselves go on as before
+
+
+def test_known_places_are_saved(tmp_path):
+    model = filled_model(explore_off_modes=True)
+    assert model.known_places.known.any()
+    model.save(tmp_path / "model")
+    model.export(tmp_path / "safe")
+    for loaded in (DDiffPG.load(tmp_path / "model"), DDiffPG.load(tmp_path / "safe", safe=True)):
+        assert th.equal(loaded.known_places.known, model.known_places.known)
