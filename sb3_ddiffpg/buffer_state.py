@@ -159,7 +159,7 @@ def restore_buffer(buffer: ModeReplayBuffer, tree: Any) -> None:
     buffer.owner = state.owner
     buffer._feature_scale, buffer._last_positions = state.feature_scale, state.last_positions
     buffer._distances.serials, buffer._distances.distances = state.serials, state.distances
-    buffer.recall_visits()
+    buffer.recall_places()
 
 
 def _layouts(buffer: ModeReplayBuffer) -> list[str]:

@@ -1,5 +1,6 @@
 """Intrinsic reward: NovelD on a measure of novelty, random network distillation or visit counts."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -145,36 +146,31 @@ class RandomNetworkDistillation(nn.Module):
         return loss.detach()
 
 
-class HashedCells(nn.Module):
+def cell_entries(positions: th.Tensor, cell_size: float, table_size: int) -> th.Tensor:
     """
-    Cells of a grid without bounds, hashed into a table of fixed size, so that the map's extent need not be known.
+    Cells of a grid without bounds, hashed into a table of fixed size, so that the map's extent need not be known. The same
+    cell has the same entry in every process.
 
-    :param dim: Number of coordinates
+    :param positions: Shape [N, dim]
     :param cell_size: Edge of a cell, in their unit
     :param table_size: Number of entries of the table
+    :return: Entry of each position's cell, shape [N]
     """
+    cells = (positions / cell_size).floor().long()
+    mixed = (cells * _multipliers(positions.shape[1], positions.device)).sum(dim=-1)
+    return (mixed ^ (mixed >> 21)) % table_size
 
-    def __init__(self, dim: int, cell_size: float, table_size: int = 2**16) -> None:
-        super().__init__()
-        self.cell_size, self.table_size = cell_size, table_size
-        # Fixed odd multipliers: the same cell must hash to the same entry in every process
-        multipliers = np.random.default_rng(0).integers(1, 2**31, size=dim, dtype=np.int64) * 2 + 1
-        self.multipliers: th.Tensor
-        self.register_buffer("multipliers", th.as_tensor(multipliers), persistent=False)
 
-    def entries(self, positions: th.Tensor) -> th.Tensor:
-        """
-        :param positions: Shape [N, dim]
-        :return: Entry of the table of every position, shape [N]
-        """
-        cells = (positions / self.cell_size).floor().long()
-        mixed = (cells * self.multipliers).sum(dim=-1)
-        return (mixed ^ (mixed >> 21)) % self.table_size
+@cache
+def _multipliers(dim: int, device: th.device) -> th.Tensor:
+    """Fixed odd numbers."""
+    numbers = np.random.default_rng(0).integers(1, 2**31, size=dim, dtype=np.int64) * 2 + 1
+    return th.as_tensor(numbers, device=device)
 
 
 class KnownPlaces(nn.Module):
     """
-    A set of cells, see ``HashedCells``.
+    A set of cells, see ``cell_entries``.
 
     :param dim: Number of coordinates
     :param cell_size: Edge of a cell, in their unit
@@ -184,27 +180,30 @@ class KnownPlaces(nn.Module):
 
     def __init__(self, dim: int, cell_size: float) -> None:
         super().__init__()
-        self.cells = HashedCells(dim, cell_size)
-        self.register_buffer("known", th.zeros(self.cells.table_size, dtype=th.bool))
+        self.cell_size = cell_size
+        self.register_buffer("known", th.zeros(2**16, dtype=th.bool))
+
+    def _entries(self, positions: th.Tensor) -> th.Tensor:
+        return cell_entries(positions, self.cell_size, len(self.known))
 
     def replace(self, positions: th.Tensor) -> None:
         """
         :param positions: In the cells that are known from now on, shape [N, dim]
         """
         self.known.zero_()
-        self.known[self.cells.entries(positions)] = True
+        self.known[self._entries(positions)] = True
 
     def contain(self, positions: th.Tensor) -> th.Tensor:
         """
         :param positions: Shape [N, dim]
         :return: Whether their cells are known, shape [N]
         """
-        return self.known[self.cells.entries(positions)]
+        return self.known[self._entries(positions)]
 
 
 class VisitCounts(nn.Module):
     """
-    Novelty as ``1 / sqrt(1 + n)``, n the visits of the position's cell (Bellemare et al., 2016), see ``HashedCells``.
+    Novelty as ``1 / sqrt(1 + n)``, n the visits of the position's cell (Bellemare et al., 2016), see ``cell_entries``.
 
     :param position_dim: Size of the position features
     :param observation_dim: Not used: counting needs few dimensions
@@ -223,9 +222,12 @@ class VisitCounts(nn.Module):
             raise ValueError(f"novelty_kwargs['cell_size'] must be positive, got {cell_size}")
         if table_size < 1:
             raise ValueError(f"novelty_kwargs['table_size'] must be at least 1, got {table_size}")
-        self.cells = HashedCells(position_dim, cell_size, table_size)
+        self.cell_size = cell_size
         self.register_buffer("counts", th.zeros(table_size))
         self.optimizer: th.optim.Optimizer | None = None
+
+    def _entries(self, positions: th.Tensor) -> th.Tensor:
+        return cell_entries(positions, self.cell_size, len(self.counts))
 
     @th.no_grad()
     def observe(self, positions: th.Tensor) -> None:
@@ -234,7 +236,7 @@ class VisitCounts(nn.Module):
 
         :param positions: Shape [N, position_dim]
         """
-        entries = self.cells.entries(positions)
+        entries = self._entries(positions)
         self.counts.index_add_(0, entries, th.ones_like(entries, dtype=self.counts.dtype))
 
     @th.no_grad()
@@ -244,7 +246,7 @@ class VisitCounts(nn.Module):
         :param observations: Not used
         :return: Shape [N]
         """
-        return (1 + self.counts[self.cells.entries(positions)]).rsqrt()
+        return (1 + self.counts[self._entries(positions)]).rsqrt()
 
     def update(self, positions: th.Tensor, observations: th.Tensor) -> th.Tensor:
         """
