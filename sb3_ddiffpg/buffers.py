@@ -58,7 +58,7 @@ class ModeBatch(NamedTuple):
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
     *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct", "loop_share", "route_share"),
-    *("new_way_share", "explore_beyond_goals", "visit_cell_size", "rare_place_boost"),
+    *("new_way_share", "explore_beyond_goals", "visit_cell_size", "n_place_candidates"),
 )
 
 
@@ -91,8 +91,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         of which a mode has not its fill
     :param explore_beyond_goals: Whether a goal does not end the exploratory group's returns
     :param visit_cell_size: Edge of the cells of mode features by which places and ``first_visits`` are told; None: not at all
-    :param rare_place_boost: So many times as many candidates are drawn for the exploratory group, of which those of rarely
-        visited places are preferred, such that with many all places are met alike; 1: all transitions alike
+    :param n_place_candidates: Transitions from which each of the exploratory group's is drawn, in inverse proportion to the
+        visits of the place that it reached; 1: all alike
     :raises ValueError: If a size is not positive or ``optimize_memory_usage`` is asked for
     """
 
@@ -128,7 +128,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         new_way_share: float = 0.0,
         explore_beyond_goals: bool = False,
         visit_cell_size: float | None = None,
-        rare_place_boost: int = 1,
+        n_place_candidates: int = 1,
     ) -> None:
         for name, value, least in (
             ("max_successes_per_mode", max_successes_per_mode, 1),
@@ -139,7 +139,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             ("loop_share", loop_share, 0),
             ("route_share", route_share, 0),
             ("new_way_share", new_way_share, 0),
-            ("rare_place_boost", rare_place_boost, 1),
+            ("n_place_candidates", n_place_candidates, 1),
         ):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
@@ -157,7 +157,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         if visit_cell_size is not None and not visit_cell_size > 0:
             raise ValueError(f"visit_cell_size must be positive, got {visit_cell_size}")
         self.visit_cell_size = visit_cell_size
-        self.rare_place_boost = rare_place_boost
+        self.n_place_candidates = n_place_candidates
         super().__init__(
             buffer_size,
             observation_space,
@@ -545,9 +545,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
 
     def _sample_places(self, n: int) -> np.ndarray:
         """Rows of the exploratory group, [n]: what happened at rarely visited places says most about where to go."""
-        if self.visit_cell_size is None or self.rare_place_boost == 1:
+        if self.visit_cell_size is None or self.n_place_candidates == 1:
             return self._all.sample(n)
-        candidates = self._all.sample(n * self.rare_place_boost)
+        candidates = self._all.sample(n * self.n_place_candidates)
         weights = 1.0 / self._place_visits[self.places[candidates]]
         return np.random.choice(candidates, n, p=weights / weights.sum())
 
