@@ -17,18 +17,6 @@ from sb3_ddiffpg.row_storage import Fields
 from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, Trajectory
 from sb3_ddiffpg.trajectory_buffer import TrajectoryReplayBuffer
 
-# Places are cells, hashed into so many numbers
-N_PLACES = 2**16
-
-
-def places_of(positions: np.ndarray, cell_size: float) -> np.ndarray:
-    """
-    :param positions: Shape [N, dim]
-    :param cell_size: Edge of the cells, in their unit
-    :return: The place of each, a number below ``N_PLACES``, shape [N]
-    """
-    return cell_entries(th.from_numpy(positions), cell_size, N_PLACES).numpy()
-
 
 class ModeBatch(NamedTuple):
     """
@@ -58,7 +46,7 @@ class ModeBatch(NamedTuple):
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
     *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct", "loop_share", "route_share"),
-    *("new_way_share", "explore_beyond_goals", "visit_cell_size", "n_place_candidates"),
+    *("new_way_share", "explore_beyond_goals", "visit_cell_size"),
 )
 
 
@@ -91,8 +79,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         of which a mode has not its fill
     :param explore_beyond_goals: Whether a goal does not end the exploratory group's returns
     :param visit_cell_size: Edge of the cells of mode features by which places and ``first_visits`` are told; None: not at all
-    :param n_place_candidates: Transitions from which each of the exploratory group's is drawn, in inverse proportion to the
-        visits of the place that it reached; 1: all alike
     :raises ValueError: If a size is not positive or ``optimize_memory_usage`` is asked for
     """
 
@@ -103,7 +89,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     way_novelty: np.ndarray
     goals: np.ndarray
     first_visits: np.ndarray
-    places: np.ndarray
 
     def __init__(
         self,
@@ -128,7 +113,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         new_way_share: float = 0.0,
         explore_beyond_goals: bool = False,
         visit_cell_size: float | None = None,
-        n_place_candidates: int = 1,
     ) -> None:
         for name, value, least in (
             ("max_successes_per_mode", max_successes_per_mode, 1),
@@ -139,7 +123,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             ("loop_share", loop_share, 0),
             ("route_share", route_share, 0),
             ("new_way_share", new_way_share, 0),
-            ("n_place_candidates", n_place_candidates, 1),
         ):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
@@ -157,7 +140,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         if visit_cell_size is not None and not visit_cell_size > 0:
             raise ValueError(f"visit_cell_size must be positive, got {visit_cell_size}")
         self.visit_cell_size = visit_cell_size
-        self.n_place_candidates = n_place_candidates
         super().__init__(
             buffer_size,
             observation_space,
@@ -183,7 +165,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.mode_rows: list[RowSet] = []
         self._new_way_rows = np.empty(0, dtype=np.int32)
         self._episode_places: list[set[int]] = [set() for _ in range(self.n_envs)]
-        self._place_visits = np.empty(0, dtype=np.int64)  # rows in store by place
 
     def _step_fields(self) -> Fields:
         action = ((self.action_dim,), np.float32)
@@ -191,13 +172,12 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
 
     def _note_fields(self) -> Fields:
         own: Fields = {name: ((), bool) for name in ("foreign", "off_route", "goals", "first_visits")}
-        own |= {"way_novelty": ((), np.float32), "places": ((), np.int32)}
+        own["way_novelty"] = (), np.float32
         return {**super()._note_fields(), **own}
 
     def _view_names(self) -> list[str]:
         own = ["target_actions", "exploratory_target_actions", "foreign", "off_route", "way_novelty", "goals"]
-        own += ["first_visits", "places"]
-        return [*super()._view_names(), *own]
+        return [*super()._view_names(), *own, "first_visits"]
 
     def _position_arrays(self) -> list[np.ndarray]:
         return [*super()._position_arrays(), self._mode_position]
@@ -208,8 +188,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.exploratory_target_actions = self._steps["exploratory_target_actions"]
         self.foreign, self.off_route = self._notes["foreign"], self._notes["off_route"]
         self.way_novelty, self.goals = self._notes["way_novelty"], self._notes["goals"]
-        self.first_visits, self.places = self._notes["first_visits"], self._notes["places"]
-        self._place_visits = np.zeros(N_PLACES, dtype=np.int64)
+        self.first_visits = self._notes["first_visits"]
         self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
         for row_set in self.mode_rows:
             row_set.position = self._mode_position
@@ -221,20 +200,16 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.foreign[rows] = self.off_route[rows] = self.goals[rows] = False
         self.way_novelty[rows] = 0.0
         self._last_positions = self.features(next_obs)
-        if self.visit_cell_size is None:
-            self.places[rows], self.first_visits[rows] = 0, True
-            return
-        places = places_of(self._last_positions, self.visit_cell_size)
-        self.places[rows] = places
-        np.add.at(self._place_visits, places, 1)
-        for row, place, seen in zip(rows, places.tolist(), self._episode_places, strict=True):
-            self.first_visits[row] = place not in seen
-            seen.add(place)
-
-    def _free_rows(self, rows: np.ndarray) -> None:
-        super()._free_rows(rows)
+        self.first_visits[rows] = True
         if self.visit_cell_size is not None:
-            np.subtract.at(self._place_visits, self.places[rows], 1)
+            places = self._places(self._last_positions)
+            for row, place, seen in zip(rows, places, self._episode_places, strict=True):
+                self.first_visits[row] = place not in seen
+                seen.add(place)
+
+    def _places(self, positions: np.ndarray) -> list[int]:
+        """The cell of each position, as a number."""
+        return cell_entries(th.from_numpy(positions), self.visit_cell_size or 1.0, 2**31).tolist()
 
     def drop_unfinished_episodes(self) -> None:
         """Forget the transitions of running episodes: call it when the environments were reset outside."""
@@ -242,19 +217,13 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         for seen in self._episode_places:
             seen.clear()
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in super().__getstate__().items() if name != "_place_visits"}
-
-    def _restore(self, *args: Any) -> None:
-        super()._restore(*args)
-        self.recall_places()
-
     def recall_places(self) -> None:
-        """After loading: where the running episodes have been, and how often each place is in store."""
-        self._place_visits = np.bincount(self.places[self._all.rows[: self._all.size]], minlength=N_PLACES)
-        for env, seen in enumerate(self._episode_places):
+        """After loading: where the running episodes have been."""
+        for env, (seen, length) in enumerate(zip(self._episode_places, self._running_length, strict=True)):
             seen.clear()
-            seen.update(self.places[self._running[env, : self._running_length[env]]].tolist())
+            if length and self.visit_cell_size is not None:
+                rows = self._running[env, :length]
+                seen.update(self._places(self._positions(self._nexts, "next_observations", rows)))
 
     def _finish(self, env: int, info: dict[str, Any]) -> Trajectory:
         trajectory = super()._finish(env, info)
@@ -498,7 +467,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             raise ValueError(f"batch_size={batch_size} is smaller than the number of groups, {n_groups}")
         active = np.array([True, *(row_set.size > 0 for row_set in self.mode_rows)])
         sets = [self._all, *(row_set if row_set.size else self._all for row_set in self.mode_rows)]
-        rows = np.stack([self._sample_places(n), *(row_set.sample(n) for row_set in sets[1:])])  # [G, n]
+        rows = np.stack([row_set.sample(n) for row_set in sets])  # [G, n]
         if len(self._new_way_rows) and self.new_way_share:
             n_new = round(self.new_way_share * n)
             rows[EXPLORATORY_GROUP, :n_new] = np.random.choice(self._new_way_rows, n_new)
@@ -542,14 +511,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             rows=rows,
             windows=np.where(lost, -1, windows),
         )
-
-    def _sample_places(self, n: int) -> np.ndarray:
-        """Rows of the exploratory group, [n]: what happened at rarely visited places says most about where to go."""
-        if self.visit_cell_size is None or self.n_place_candidates == 1:
-            return self._all.sample(n)
-        candidates = self._all.sample(n * self.n_place_candidates)
-        weights = 1.0 / self._place_visits[self.places[candidates]]
-        return np.random.choice(candidates, n, p=weights / weights.sum())
 
     def _windows(self, rows: np.ndarray, exploration_n_steps: int, mode_n_steps: int) -> tuple[np.ndarray, np.ndarray]:
         """The rows that follow each row in its trajectory, itself first, -1 beyond its end; their notes. [G, n, n_steps]"""

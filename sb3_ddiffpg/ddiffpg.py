@@ -116,8 +116,6 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         section 3): otherwise explorers stand where fewest have been
     :param explore_off_modes: Whether explorers are paid nothing for places where the trajectories go that train the modes, so
         that another way pays where it leaves the known ones, not only where it ends
-    :param n_place_candidates: Transitions from which each of the exploratory group's is drawn, such that all places are met
-        alike, however often they were visited: what happened at rare ones says most about where to go. 1: transitions alike
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
     :param max_grad_norm: Largest gradient norm of the policy and of each mode's critics
@@ -205,7 +203,6 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         normalize_intrinsic: bool = True,
         episodic_novelty: bool = True,
         explore_off_modes: bool = True,
-        n_place_candidates: int = 8,
         reset_new_critics: bool = True,
         max_grad_norm: float = 1.0,
         control: str | None = None,
@@ -284,7 +281,6 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         self.explore_then_exploit = explore_then_exploit
         self.explore_beyond_goals = explore_beyond_goals
         self.explore_off_modes = explore_off_modes
-        self.n_place_candidates = n_place_candidates
         self.mode_intrinsic_coef = mode_intrinsic_coef
         self.new_way_coef = new_way_coef
         self.reset_new_critics = reset_new_critics
@@ -324,7 +320,6 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             "max_successes_per_mode": self.max_successes_per_mode,
             "max_failures_per_mode": self.max_failures_per_mode,
             "explore_beyond_goals": self.explore_beyond_goals,
-            "n_place_candidates": self.n_place_candidates,
             "new_way_share": NEW_WAY_SHARE if self.new_way_coef else 0.0,
         }
 

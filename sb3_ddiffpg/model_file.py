@@ -146,9 +146,9 @@ def build_model(
         model.load_state_tree(saved.state)
         model._setup_model()
         parameters = _parameters(model, saved.parameters)
+        model.set_parameters(parameters, exact_match=True, device=model.device)
     except (TypeError, AttributeError, AssertionError, KeyError, IndexError, RuntimeError, OverflowError) as error:
         raise ValueError(f"model: its arguments make no {algorithm.__name__}: {error!r}") from error
-    model.set_parameters(parameters, exact_match=True, device=model.device)
     return model
 
 

@@ -2,7 +2,7 @@
 
 import io
 import pickle
-from collections import Counter, defaultdict
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -139,7 +139,7 @@ class BufferMachine(RuleBasedStateMachine):
         self.n_envs, self.longest, self.number, self.most_modes = n_envs, 6, 0, 3
         # Room for the episodes in progress, and for the one success of each mode that is never evicted
         size = self.longest * (n_envs + self.most_modes) + spare
-        places = {"visit_cell_size": 1.0, "n_place_candidates": 3, "explore_beyond_goals": beyond}
+        places = {"visit_cell_size": 1.0, "explore_beyond_goals": beyond}
         self.buffer = make_buffer(size, n_envs, max_successes_per_mode=4, max_failures_per_mode=2, **places)
         self.plain = PlainBuffer(size, n_envs, 4, 2, beyond)
 
@@ -290,9 +290,6 @@ class BufferMachine(RuleBasedStateMachine):
             np.testing.assert_array_equal(getattr(self.buffer, name)[rows], np.stack([step[key] for step in steps]))
         np.testing.assert_allclose(self.buffer.rewards[rows], [step["reward"] for step in steps])
         self._same_trajectories(stored)
-        cells = Counter(cell(step["next_obs"]) for step in steps)
-        visits = self.buffer._place_visits[self.buffer.places[rows]]
-        assert visits.tolist() == [cells[cell(step["next_obs"])] for step in steps]
         # Free rows are never drawn
         assert set(self.buffer.sample(50).observations[:, 0].int().tolist()) <= stored.keys()
 
@@ -337,19 +334,6 @@ def test_row_sets_are_sets(changes, seed):
         assert set(ours.rows[: ours.size].tolist()) == expected and ours.size == len(expected)
         if expected:
             assert set(ours.sample(40).tolist()) <= expected
-
-
-def test_rare_places_are_met_as_often_as_others():
-    """Of two places, one visited 4 times as often: alike with many candidates, as stored with one."""
-    for candidates, expected in ((1, 0.2), (16, 0.5)):
-        buffer = make_buffer(1000, visit_cell_size=1.0, n_place_candidates=candidates)
-        for step in range(1000):
-            place = np.array([[0.5, 5.5 if step % 5 == 0 else 0.5]])
-            buffer.add(place, place, np.zeros((1, 2)), np.zeros(1), np.array([step % 10 == 9]), [{}])
-        np.random.seed(0)
-        batch = buffer.sample_modes(4000, GAMMA, 1, 1)
-        share = float((batch.observations[:, 1] > 5).float().mean())
-        assert share == pytest.approx(expected, abs=0.03)
 
 
 def test_row_set_draws_every_row_equally_often():
