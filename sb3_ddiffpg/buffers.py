@@ -171,8 +171,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         return {**super()._step_fields(), "target_actions": action, "exploratory_target_actions": action}
 
     def _note_fields(self) -> Fields:
-        own: Fields = {name: ((), bool) for name in ("foreign", "off_route", "goals", "first_visits")}
-        own["way_novelty"] = (), np.float32
+        own: Fields = {"foreign": ((), bool), "off_route": ((), bool), "way_novelty": ((), np.float32), "goals": ((), bool)}
+        own["first_visits"] = (), bool
         return {**super()._note_fields(), **own}
 
     def _view_names(self) -> list[str]:
@@ -489,8 +489,10 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         last = np.take_along_axis(windows, ends, axis=-1).ravel()
         ended = np.take_along_axis(notes["dones"] & ~notes["timeouts"], ends, axis=-1)[..., 0]
         if self.explore_beyond_goals:
-            # A goal that ended what exploring is worth would be the one place that explorers keep away from
-            ended[EXPLORATORY_GROUP] &= ~np.take_along_axis(notes["goals"], ends, axis=-1)[EXPLORATORY_GROUP, :, 0]
+            # A goal that ended what exploring is worth would be the one place that explorers keep away from. One that is paid
+            # for ends it, or it would be paid again and again
+            unpaid = notes["goals"] & ~((notes["way_novelty"] > 0) & (self.new_way_share > 0))
+            ended[EXPLORATORY_GROUP] &= ~np.take_along_axis(unpaid, ends, axis=-1)[EXPLORATORY_GROUP, :, 0]
         discounts = np.float32(gamma) ** lengths * ~(ended | lost.any(axis=-1))
         steps = self._on_device(self._steps.tensors(rows.ravel()))
         nexts = self._on_device(self._nexts.tensors(last))

@@ -452,6 +452,14 @@ def test_goals_by_new_ways_are_worth_something_to_exploration():
         assert value == pytest.approx(expected), (obs[k], ends[k])
     assert (batch.new_ways > 0).any()
     buffer.new_way_share = 0.5
+    # What is paid for at a goal ends the return, or it would be paid again at the next step
+    buffer.explore_beyond_goals = True
+    batch = buffer.sample_modes(400, GAMMA, 1, 1)
+    goes_on = (batch.discounts[0] > 0).numpy()
+    rows = batch.rows[0]
+    paid = buffer.way_novelty[rows] > 0
+    assert paid.any() and (buffer.goals[rows] & ~paid).any()
+    np.testing.assert_array_equal(goes_on, ~buffer.dones[rows] | (buffer.goals[rows] & ~paid))
     drawn = buffer.observations[buffer.sample_modes(900, GAMMA, 1, 1).rows[0], 0]
     assert {6, 7, 8} == set(drawn[:150]) and set(drawn[150:]) == set(range(10))
     buffer._evict()  # the first to go is a retired one, which none of them is
