@@ -211,7 +211,10 @@ class NoveltyActorCritic(SavableAlgorithm):
     def _visit_cell_size(self) -> float:
         """Edge of the cells by which places are told apart."""
         if self.novelty == "counts":
-            return float((self.novelty_kwargs or {}).get("cell_size", VisitCounts.default_cell_size))
+            cell_size = (self.novelty_kwargs or {}).get("cell_size", VisitCounts.default_cell_size)
+            if not cell_size > 0:
+                raise ValueError(f"novelty_kwargs['cell_size'] must be positive, got {cell_size}")
+            return float(cell_size)
         return declared_cell_size(self.env)
 
     def _check_arguments(self) -> None:

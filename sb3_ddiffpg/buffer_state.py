@@ -126,7 +126,9 @@ def restore_buffer(buffer: ModeReplayBuffer, tree: Any) -> None:
     :raises ValueError: If it is something else or contradicts itself; the buffer is as before then
     """
     if tree is None:
+        n_modes = len(buffer.mode_rows)
         buffer.reset()
+        buffer.expect_modes(n_modes)
         return
     state = convert(tree, _Buffer, "replay buffer")
     trajectories = _trajectories(state.trajectories)

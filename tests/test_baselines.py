@@ -116,7 +116,7 @@ def test_rewards_are_the_environments_and_what_is_new(model_free, n_steps):
                 model.novelty_model.novelty(*model._novelty_inputs(th.from_numpy(obs[row : row + 1]))).item()
                 for obs in (buffer.observations, buffer.next_observations)
             )
-            new = model.intrinsic_coef * max(then - model.novelty_scale * now, 0.0)
+            new = model.intrinsic_coef * max(then - model.novelty_scale * now, 0.0) * buffer.first_visits[row]
             expected += 0.9**step * (3.0 * buffer.rewards[row] + new)
         assert seen["rewards"][0, k].item() == pytest.approx(expected, rel=1e-4, abs=1e-6)
     assert batch.windows.shape[-1] == n_steps

@@ -212,9 +212,10 @@ def test_a_second_interrupt_is_not_patient(tmp_path):
             signal.raise_signal(signal.SIGINT)
             return True
 
+    before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         model.learn(400, callback=[Sends(), RunCheckpointCallback(tmp_path)])
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_second_learn_goes_on_where_it_was(tmp_path):
@@ -227,7 +228,7 @@ def test_a_second_learn_goes_on_where_it_was(tmp_path):
     resumed.learn(200, reset_num_timesteps=False)
     assert outcome(resumed) == outcome(whole)
     resumed.learn(50, reset_num_timesteps=False)  # a call like any other
-    assert 350 <= resumed.num_timesteps < 370
+    assert 350 <= resumed.num_timesteps < 400
 
 
 def test_only_the_newest_stay(tmp_path):

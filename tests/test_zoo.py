@@ -308,7 +308,7 @@ def test_a_configuration_of_ours_by_name(tmp_path):
     options = ["--env", "AntMazeV1-v0", "-f", str(tmp_path), "-n", "8", *hyperparams(n_envs=4)]
     main(["train", "--conf-file", "ddiffpg-cpu", *options])
     config = yaml.unsafe_load((tmp_path / "ddiffpg" / "AntMazeV1-v0_1" / "AntMazeV1-v0" / "config.yml").read_text())
-    assert config["env_kwargs"] == {"integrator": "euler"} and config["n_envs"] == 4
+    assert config["env_kwargs"] == {"integrator": "euler", "ends_on_fall": True} and config["n_envs"] == 4
     for name in ("no.yml", "ddiffpg-gpu"):
         with pytest.raises(SystemExit, match=rf"--conf-file: '{name}' given; accepted are .*'ddiffpg', 'ddiffpg-cpu', "):
             main(["train", "--env", ENV, "--conf-file", name, "-f", str(tmp_path)])
