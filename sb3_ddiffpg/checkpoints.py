@@ -248,7 +248,11 @@ class RunCheckpointCallback(BaseCallback):
         except OSError as error:
             warnings.warn(f"No checkpoint at step {self.num_timesteps}: {error}. The ones before stay, training goes on")
             return False
-        for old in checkpoint_files(self.folder)[self.keep :]:
+        # By age: an older run may have come further
+        others = sorted(
+            (each for each in checkpoint_files(self.folder) if each != path), key=lambda each: each.stat().st_mtime
+        )
+        for old in others[: max(0, len(others) - self.keep + 1)]:
             old.unlink(missing_ok=True)
         if self.verbose >= 1:
             print(f"[checkpoint] {path}")

@@ -60,6 +60,8 @@ def restore_global_rng(tree: Any) -> None:
     state = convert(tree, _Global, "random states")
     check_array(state.numpy_key, np.uint32, [624], "random states.numpy")
     check_array(state.torch, np.uint8, [len(th.get_rng_state())], "random states.torch")
+    if not 0 <= state.numpy_rest[0] <= 624:  # NumPy would read beyond its array
+        raise ValueError(f"random states.numpy: position {state.numpy_rest[0]} given; accepted are 0 to 624")
     version, numbers, gauss = state.python
     try:
         random.setstate((version, tuple(numbers), gauss))

@@ -19,7 +19,7 @@ from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.rng import global_rng, restore_generator
+from sb3_ddiffpg.rng import global_rng, restore_generator, restore_global_rng
 
 END = 560
 
@@ -264,3 +264,17 @@ def test_no_reader_sees_half_a_file(tmp_path):
     stop.set()
     thread.join()
     assert seen and set(seen) == {model.num_timesteps}
+
+
+def test_a_new_run_keeps_its_checkpoint_beside_those_of_a_longer_one(tmp_path):
+    model_for(known_ends()).learn(400, callback=RunCheckpointCallback(tmp_path, save_freq=100, keep=2))
+    model_for(known_ends(), seed=5).learn(250, callback=RunCheckpointCallback(tmp_path, save_freq=100, keep=2))
+    assert max(int(path.stem.split("_")[1]) for path in checkpoint_files(tmp_path)) < 300
+
+
+def test_a_random_state_that_numpy_would_crash_with_is_refused():
+    state = global_rng()
+    state["torch"] = state["torch"].numpy()
+    for position in (-1, 625, 2**30):
+        with pytest.raises(ValueError, match="accepted are 0 to 624"):
+            restore_global_rng({**state, "numpy_rest": [position, *state["numpy_rest"][1:]]})
