@@ -19,7 +19,6 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.features import declared_cell_size, declared_mode_features, describe_env
-from sb3_ddiffpg.interrupts import handlers_restored
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, VisitCounts, noveld_reward
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
 from sb3_ddiffpg.persistence import SavableAlgorithm
@@ -472,14 +471,10 @@ class NoveltyActorCritic(SavableAlgorithm):
         Train the model. See SB3's ``learn``; ``log_interval`` counts episodes of all environments. The first call after
         ``resume`` is given what the interrupted one was given, and does what was left of it.
         """
-        if self._interrupted is not None:
-            done = self.num_timesteps - (0 if reset_num_timesteps else self._num_timesteps_at_start)
-            total_timesteps, reset_num_timesteps = max(0, total_timesteps - done), False
         # Denormal numbers in Adam's moments slow a small update down by half
         th.set_flush_denormal(True)
         try:
-            with handlers_restored():
-                return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         finally:
             th.set_flush_denormal(False)
 

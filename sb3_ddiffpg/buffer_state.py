@@ -170,8 +170,7 @@ def _layouts(buffer: ModeReplayBuffer) -> list[str]:
 
 
 def _row_dtypes(buffer: ModeReplayBuffer) -> list[np.dtype]:
-    fields = buffer._step_fields(), buffer._observation_fields("next_observations"), buffer._note_fields()
-    return [HostRows(0, part).dtype for part in fields]
+    return [HostRows(0, part).dtype for part in buffer.part_fields()]
 
 
 def _trajectories(columns: _Trajectories) -> list[Trajectory]:

@@ -200,12 +200,13 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.foreign[rows] = self.off_route[rows] = self.goals[rows] = False
         self.way_novelty[rows] = 0.0
         self._last_positions = self.features(next_obs)
-        self.first_visits[rows] = True
-        if self.visit_cell_size is not None:
-            places = self._places(self._last_positions)
-            for row, place, seen in zip(rows, places, self._episode_places, strict=True):
-                self.first_visits[row] = place not in seen
-                seen.add(place)
+        if self.visit_cell_size is None:
+            self.first_visits[rows] = True
+            return
+        places = self._places(self._last_positions)
+        self.first_visits[rows] = [place not in seen for place, seen in zip(places, self._episode_places, strict=True)]
+        for place, seen in zip(places, self._episode_places, strict=True):
+            seen.add(place)
 
     def _places(self, positions: np.ndarray) -> list[int]:
         """The cell of each position, as a number."""

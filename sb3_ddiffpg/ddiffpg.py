@@ -391,8 +391,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         :return: What happened: births, splits, merges and retirements
         """
         events = super().recluster()
-        rows = self.replay_buffer.mode_success_rows()
-        if self.explore_off_modes and len(rows):
+        if self.explore_off_modes and len(rows := self.replay_buffer.mode_success_rows()):
             reached = self.replay_buffer.read_observations(rows)[1]
             self.known_places.replace(self.replay_buffer.features.of_tensors(reached))
         return events

@@ -22,7 +22,7 @@ Model = TypeVar("Model", bound=Any)
 #: What a file that holds a model says it is
 KIND = "model"
 # Of the constructor, but not the model's: given again when it is loaded
-GIVEN_AT_LOADING = {"self", "policy", "env", "device", "tensorboard_log", "_init_setup_model"}
+GIVEN_AT_LOADING = {"policy", "env", "device", "tensorboard_log", "_init_setup_model"}
 
 
 class _Space(msgspec.Struct, forbid_unknown_fields=True):

@@ -10,9 +10,10 @@ from typing import Any, ClassVar, TypeVar
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_ddiffpg.checkpoints import InterruptedRun, read_checkpoint
+from sb3_ddiffpg.interrupts import handlers_restored
 from sb3_ddiffpg.model_file import KIND, build_model, model_tree
 from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
 from sb3_ddiffpg.safe_files import convert, read, write
@@ -45,6 +46,24 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         "_warned_support": bool,
         "_warned_cut_values": bool,
     }
+
+    def learn(
+        self: SelfSavable,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "run",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfSavable:
+        """
+        See SB3's ``learn``. The first call after ``resume`` does what was left of the interrupted one.
+        """
+        if self._interrupted is not None:
+            done = self.num_timesteps - (0 if reset_num_timesteps else self._num_timesteps_at_start)
+            total_timesteps, reset_num_timesteps = max(0, total_timesteps - done), False
+        with handlers_restored():
+            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def save(
         self,

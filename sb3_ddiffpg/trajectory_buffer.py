@@ -132,10 +132,17 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         """What is read at all rows of a window."""
         return {"rewards": ((), np.float32), "next_row": ((), np.int32), "dones": ((), bool), "timeouts": ((), bool)}
 
+    def part_fields(self) -> tuple[Fields, Fields, Fields]:
+        """
+        :return: Fields of the three parts of a row: step, next observation, notes
+        """
+        return self._step_fields(), self._observation_fields("next_observations"), self._note_fields()
+
     def _allocate(self) -> None:
-        self._steps = make_rows(self.buffer_size, self._step_fields(), self.storage_device)
-        self._nexts = make_rows(self.buffer_size, self._observation_fields("next_observations"), self.storage_device)
-        self._notes = HostRows(self.buffer_size, self._note_fields())
+        steps, nexts, notes = self.part_fields()
+        self._steps = make_rows(self.buffer_size, steps, self.storage_device)
+        self._nexts = make_rows(self.buffer_size, nexts, self.storage_device)
+        self._notes = HostRows(self.buffer_size, notes)
         self.observations = self._as_observation(self._steps, "observations")
         self.next_observations = self._as_observation(self._nexts, "next_observations")
         self.actions = self._steps["actions"]

@@ -6,7 +6,6 @@ scripts (https://rl-baselines3-zoo.readthedocs.io) and DDiffPG where nothing els
 import argparse
 import difflib
 import importlib.util
-import inspect
 import os
 import runpy
 import sys
@@ -28,6 +27,7 @@ from sb3_ddiffpg.callbacks import ModeEvalCallback
 from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import is_ours, make_vec_env
+from sb3_ddiffpg.model_file import constructor_arguments
 from sb3_ddiffpg.schedules import LateLinearSchedule
 
 try:
@@ -62,7 +62,7 @@ ZOO_KEYS = {
 # How a learning rate may be given: 3e-4, `lin_3e-4`, `late_3e-4`
 SCHEDULES: dict[str, Callable[[float], Any]] = {"": float, "lin": SimpleLinearSchedule, "late": LateLinearSchedule}
 # Constructor arguments that come from the command line
-COMMAND_LINE_ARGUMENTS = {"self", "env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
+COMMAND_LINE_ARGUMENTS = {"env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
 
 
 def register() -> None:
@@ -100,15 +100,7 @@ def check_hyperparameters(algo: str, keys: Sequence[str]) -> None:
     :raises TypeError: If one is neither a key of the zoo nor an argument of the algorithm. Not a ValueError: the zoo
         takes those for an unlucky trial when it optimises.
     """
-    # A constructor with **kwargs hands them on to the one above it
-    arguments: set[str] = set()
-    for each in ALGOS[algo].__mro__:
-        if "__init__" in vars(each):
-            parameters = inspect.signature(vars(each)["__init__"]).parameters.values()
-            arguments |= {parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD}
-            if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-                break
-    arguments -= COMMAND_LINE_ARGUMENTS
+    arguments = constructor_arguments(ALGOS[algo]) - COMMAND_LINE_ARGUMENTS
     for key in keys:
         if key in arguments or key in ZOO_KEYS:
             continue
@@ -130,6 +122,7 @@ class ModeExperimentManager(ExperimentManager):
         if self.is_own:
             self.deterministic_eval = False
         if resume is not None:
+            self.continue_training = True  # with what ``_load_pretrained_agent`` gives
             self.save_path = str(resume)
             self.params_path = f"{resume}/{self.env_name}"
 
@@ -154,6 +147,12 @@ class ModeExperimentManager(ExperimentManager):
         return {**ExperimentManager._preprocess_schedules(others), **schedules}
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        if self.resume is not None:
+            own: Any = ALGOS[self.algo]
+            settings = {"verbose": self.verbose, "tensorboard_log": self.tensorboard_log, "device": self.device}
+            resumed: BaseAlgorithm = own.resume(self.resume / "checkpoints", env, **settings)
+            print(f"Going on at step {resumed.num_timesteps} of {self.n_timesteps}")
+            return resumed
         model = super()._load_pretrained_agent(hyperparams, env)
         # The zoo counts steps from zero again; with a full buffer the random warm-up would only do harm
         if self.is_own and model.replay_buffer.size() > 0:  # type: ignore[attr-defined]
@@ -166,20 +165,6 @@ class ModeExperimentManager(ExperimentManager):
         if self.is_own and self.checkpoint_freq > 0 and not self.optimize_hyperparameters:
             folder = Path(self.save_path) / "checkpoints"
             self.callbacks.append(RunCheckpointCallback(folder, self.checkpoint_freq, verbose=self.verbose))
-
-    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
-        """
-        :return: The model, new or from a checkpoint, and its hyperparameters
-        """
-        prepared = super().setup_experiment()
-        if self.resume is None or prepared is None:
-            return prepared
-        model, hyperparams = prepared
-        resumed = type(model).resume(  # type: ignore[attr-defined]
-            self.resume / "checkpoints", model.get_env(), verbose=self.verbose, tensorboard_log=self.tensorboard_log
-        )
-        print(f"Going on at step {resumed.num_timesteps} of {self.n_timesteps}")
-        return resumed, hyperparams
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         """

@@ -61,14 +61,11 @@ def env_snapshot(env: gym.Env) -> dict[str, Any] | None:
     :param env: An environment that says with ``state_dict()`` where its episode is; perhaps in wrappers of gymnasium and SB3
     :return: What ``restore_env`` takes; None if it cannot be told
     """
-    layers = []
-    while isinstance(env, gym.Wrapper):
-        if type(env) not in _GYM_WRAPPERS:
-            return None
-        values = {name: getattr(env, name) for name in _GYM_WRAPPERS[type(env)]}
-        layers.append({"kind": type(env).__name__, "values": values})
-        env = env.env
-    return {"layers": layers, "core": env.state_dict()} if hasattr(env, "state_dict") else None
+    peeled = _peel(env, gym.Wrapper, "env", _GYM_WRAPPERS)
+    if peeled is None or not hasattr(peeled[1], "state_dict"):
+        return None
+    layers, core = peeled
+    return {"layers": layers, "core": core.state_dict()}
 
 
 def restore_env(env: gym.Env, tree: Any) -> None:
@@ -78,17 +75,15 @@ def restore_env(env: gym.Env, tree: Any) -> None:
     :raises ValueError: If it is of another environment
     """
     snapshot = convert(tree, _Snapshot, "environment")
-    for layer in snapshot.layers:
-        if type(env).__name__ != layer.kind or set(layer.values) != set(_GYM_WRAPPERS.get(type(env), ())):
-            raise ValueError(f"environment: saved with a {layer.kind} where there is a {type(env).__name__}")
-        for name, value in layer.values.items():
-            setattr(env, name, value)
-        if isinstance(env, wrappers.PassiveEnvChecker):  # it checks first calls, which others were
-            env.checked_reset = env.checked_step = env.checked_data_reuse = True
-        env = env.env  # type: ignore[attr-defined]
-    if isinstance(env, gym.Wrapper) or not hasattr(env, "load_state_dict"):
-        raise ValueError(f"environment: saved of another than {type(env).__name__}")
-    env.load_state_dict(snapshot.core)
+    layers, core = _match(env, snapshot, "env", _GYM_WRAPPERS, "environment")
+    if isinstance(core, gym.Wrapper) or not hasattr(core, "load_state_dict"):
+        raise ValueError(f"environment: saved of another than {type(core).__name__}")
+    for wrapper, values in layers:
+        for name, value in values.items():
+            setattr(wrapper, name, value)
+        if isinstance(wrapper, wrappers.PassiveEnvChecker):  # it checks first calls, which others were
+            wrapper.checked_reset = wrapper.checked_step = wrapper.checked_data_reuse = True
+    core.load_state_dict(snapshot.core)
 
 
 def vec_env_snapshot(env: VecEnv) -> dict[str, Any] | None:
@@ -96,17 +91,14 @@ def vec_env_snapshot(env: VecEnv) -> dict[str, Any] | None:
     :param env: Vectorised environments
     :return: What ``restore_vec_env`` takes; None if it cannot be told
     """
-    layers = []
-    while isinstance(env, VecEnvWrapper):
-        if type(env) not in _VEC_WRAPPERS:
-            return None
-        values = {name: getattr(env, name) for name in _VEC_WRAPPERS[type(env)]}
-        layers.append({"kind": type(env).__name__, "values": values})
-        env = env.venv
-    if hasattr(env, "state_dict"):
-        core = env.state_dict()
+    peeled = _peel(env, VecEnvWrapper, "venv", _VEC_WRAPPERS)
+    if peeled is None:
+        return None
+    layers, inner = peeled
+    if hasattr(inner, "state_dict"):
+        core = inner.state_dict()
     else:
-        core = [env_snapshot(each) for each in env.envs] if isinstance(env, DummyVecEnv) else None
+        core = [env_snapshot(each) for each in inner.envs] if isinstance(inner, DummyVecEnv) else None
     known = core is not None and not (isinstance(core, list) and None in core)
     return {"layers": layers, "core": core} if known else None
 
@@ -118,29 +110,51 @@ def restore_vec_env(env: VecEnv, tree: Any) -> None:
     :raises ValueError: If it is of another
     """
     snapshot = convert(tree, _Snapshot, "environments")
-    for layer in snapshot.layers:
-        if type(env).__name__ != layer.kind or set(layer.values) != set(_VEC_WRAPPERS.get(type(env), ())):
-            raise ValueError(f"environments: saved with a {layer.kind} where there is a {type(env).__name__}")
-        for name, value in layer.values.items():
-            before = getattr(env, name)
+    layers, core = _match(env, snapshot, "venv", _VEC_WRAPPERS, "environments")
+    for wrapper, values in layers:
+        for name, value in values.items():
+            before = getattr(wrapper, name)
             if isinstance(before, np.ndarray):
-                value = check_array(
-                    convert(value, np.ndarray, name), before.dtype, before.shape, f"environments.{name}"
-                ).copy()
+                array = convert(value, np.ndarray, name)
+                value = check_array(array, before.dtype, before.shape, f"environments.{name}").copy()
             else:
                 value = convert(value, type(before), f"environments.{name}")
-            setattr(env, name, value)
-        env = env.venv  # type: ignore[attr-defined]
-    if isinstance(env, DummyVecEnv):
+            setattr(wrapper, name, value)
+    if isinstance(core, DummyVecEnv):
         states = convert(snapshot.core, list[Any], "environments")
-        if len(states) != env.num_envs:
-            raise ValueError(f"environments: {len(states)} saved, there are {env.num_envs}")
-        for each, state in zip(env.envs, states, strict=True):
+        if len(states) != core.num_envs:
+            raise ValueError(f"environments: {len(states)} saved, there are {core.num_envs}")
+        for each, state in zip(core.envs, states, strict=True):
             restore_env(each, state)
-    elif hasattr(env, "load_state_dict"):
-        env.load_state_dict(snapshot.core)
+    elif hasattr(core, "load_state_dict"):
+        core.load_state_dict(snapshot.core)
     else:
-        raise ValueError(f"environments: saved of another kind than {type(env).__name__}")
+        raise ValueError(f"environments: saved of another kind than {type(core).__name__}")
+
+
+def _peel(env: Any, wrapper: type, inner: str, known: dict[type, tuple[str, ...]]) -> tuple[list[dict[str, Any]], Any] | None:
+    """What each wrapper remembers, from the outermost on, and what is within; None if one is not known."""
+    layers = []
+    while isinstance(env, wrapper):
+        if type(env) not in known:
+            return None
+        values = {name: getattr(env, name) for name in known[type(env)]}
+        layers.append({"kind": type(env).__name__, "values": values})
+        env = getattr(env, inner)
+    return layers, env
+
+
+def _match(
+    env: Any, snapshot: _Snapshot, inner: str, known: dict[type, tuple[str, ...]], what: str
+) -> tuple[list[tuple[Any, dict[str, Any]]], Any]:
+    """Each wrapper with what one of its kind remembered, and what is within."""
+    layers = []
+    for layer in snapshot.layers:
+        if type(env).__name__ != layer.kind or set(layer.values) != set(known.get(type(env), ())):
+            raise ValueError(f"{what}: saved with a {layer.kind} where there is a {type(env).__name__}")
+        layers.append((env, layer.values))
+        env = getattr(env, inner)
+    return layers, env
 
 
 def normalization(env: VecNormalize) -> dict[str, Any]:

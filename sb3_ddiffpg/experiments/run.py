@@ -156,6 +156,7 @@ def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: 
     (folder / "logs").mkdir(parents=True, exist_ok=True)
     entry = folder / "logs" / "hyperparams.yml"
     entry.write_text(yaml.safe_dump({env_id: hyperparams}))
+    checkpoints = folder / "logs" / "checkpoints"
     manager = ModeExperimentManager(
         argparse.Namespace(),
         algo,
@@ -166,15 +167,13 @@ def run(algo: str, env_id: str, seed: int, hyperparams: dict[str, Any], folder: 
         eval_freq=-1,
         log_interval=-2,
         verbose=1,
+        resume=folder / "logs" if checkpoint_files(checkpoints) else None,
     )
     manager.save_path = str(folder / "logs")
     manager.params_path = str(folder / "logs")
     prepared = manager.setup_experiment()
     assert prepared is not None
     model = prepared[0]
-    checkpoints = folder / "logs" / "checkpoints"
-    if isinstance(model, SavableAlgorithm) and checkpoint_files(checkpoints):
-        model = type(model).resume(checkpoints, model.get_env(), verbose=model.verbose)
     record: dict[str, Any] = {
         **wanted,
         "command": shlex.join(["python", "-m", "sb3_ddiffpg.experiments.run", *sys.argv[1:]]),
