@@ -39,7 +39,7 @@ clean:
 	touch $@
 
 .venv/.installed-dev: $(DEPENDENCIES) | .venv
-	$(BIN)/pip install --quiet -c constraints.txt -e ".[zoo,plots,franka,dev]"
+	$(BIN)/pip install --quiet -c constraints.txt -e ".[all,dev]"
 	touch $@ .venv/.installed
 
 .venv:

@@ -456,6 +456,26 @@ class NoveltyActorCritic(SavableAlgorithm):
                 f"[v_min={self.v_min}, v_max={self.v_max}] and is clipped: adapt v_min, v_max or reward_scale"
             )
 
+    def state_values(self, observation: np.ndarray | dict[str, np.ndarray], n_actions: int = 8) -> np.ndarray:
+        """
+        What the critics expect from here: the discounted, scaled return, as the mean over actions drawn from the policy of the
+        smaller of the twins' values.
+
+        :param observation: A batch of N observations, normalised if the model was trained so
+        :param n_actions: Actions drawn for each
+        :return: Shape [N]
+        """
+        self.policy.set_training_mode(False)
+        tensors, _ = self.policy.obs_to_tensor(observation)
+        with th.no_grad():
+            drawn = [self._values_of_drawn_actions(tensors) for _ in range(n_actions)]
+        return th.stack(drawn).mean(dim=0).cpu().numpy()
+
+    def _values_of_drawn_actions(self, obs: Any) -> th.Tensor:
+        """The smaller of the twins' values, [N]."""
+        features, actions = self.policy.critic_features(obs), self.policy(obs)
+        return self.policy.critics.values(self.policy.critics(features, actions[None])).amin(dim=1)[0]
+
     # ------------------------------------------------------------------ a run's beginning and end
 
     def learn(

@@ -469,6 +469,18 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             indices = table.index(mode) if single else np.array([table.index(each) for each in mode])  # type: ignore[arg-type, union-attr]
         return self.policy.predict(observation, state, episode_start, deterministic, mode=indices)
 
+    def state_values(self, observation: np.ndarray | dict[str, np.ndarray], n_actions: int = 8) -> np.ndarray:
+        """
+        See ``NoveltyActorCritic``: what the best mode expects; where there is none yet, what exploration does.
+
+        :param observation: A batch of N observations
+        :param n_actions: Actions drawn for each mode
+        :return: Shape [N]
+        """
+        self.policy.set_training_mode(False)
+        values = self.policy.group_values(self.policy.obs_to_tensor(observation)[0], n_actions)
+        return (values[1:].amax(dim=0) if len(self.modes) else values[EXPLORATORY_GROUP]).cpu().numpy()
+
     def _training_actions(self) -> np.ndarray:
         lengths = [mode.mean_length for mode in self._modes if mode.n_trajectories]
         if lengths:

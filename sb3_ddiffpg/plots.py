@@ -146,6 +146,37 @@ def plot_dendrogram(model: Any) -> Figure:
     return figure
 
 
+def draw_visits(axes: Any, visits: VisitMap, maze: Any = None) -> Any:
+    """
+    Visits by cell; of three coordinates the first two.
+
+    :param axes: Where
+    :param visits: At least one
+    :param maze: An ``envs.Maze`` that is drawn below
+    :return: The image, for a colour bar
+    """
+    centres, counts = visits.cells()
+    columns = np.round(_in_plane(centres) / visits.cell_size - 0.5).astype(int)
+    coarse = int(np.ptp(columns, axis=0).max()) // 1000 + 1  # a stray far away must not make a picture of a million cells
+    columns //= coarse
+    edge = coarse * visits.cell_size
+    low = columns.min(axis=0)
+    density = np.zeros(columns.max(axis=0) - low + 1)
+    np.add.at(density, tuple((columns - low).T), counts)
+    shown = np.where(density > 0, np.minimum(density, MAX_DENSITY), np.nan)
+    if maze is not None:
+        _draw_maze(axes, maze)
+    edges = low * edge, (columns.max(axis=0) + 1) * edge
+    extent = (edges[0][0], edges[1][0], edges[0][1], edges[1][1])
+    image = axes.imshow(
+        shown.T, origin="lower", extent=extent, norm=LogNorm(1, MAX_DENSITY), cmap="viridis", alpha=0.85, zorder=0.5
+    )
+    if maze is not None:
+        axes.set(xlim=maze.extent[:2], ylim=maze.extent[2:])
+    _label_axes(axes)
+    return image
+
+
 def plot_exploration(visits: VisitMap | None, maze: Any = None) -> Figure:
     """
     Where training went (visits by cell; of three coordinates the first two), and how many cells it knew when.
@@ -156,32 +187,36 @@ def plot_exploration(visits: VisitMap | None, maze: Any = None) -> Figure:
     """
     if visits is None or not len(visits):
         return _empty("no visit was counted")
-    centres, counts = visits.cells()
-    columns = np.round(_in_plane(centres) / visits.cell_size - 0.5).astype(int)
-    coarse = int(np.ptp(columns, axis=0).max()) // 1000 + 1  # a stray far away must not make a picture of a million cells
-    columns //= coarse
-    edge = coarse * visits.cell_size
-    low = columns.min(axis=0)
-    density = np.zeros(columns.max(axis=0) - low + 1)
-    np.add.at(density, tuple((columns - low).T), counts)
-    shown = np.where(density > 0, np.minimum(density, MAX_DENSITY), np.nan)
     figure = _new(11, 4.6)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    if maze is not None:
-        _draw_maze(left, maze)
-    edges = low * edge, (columns.max(axis=0) + 1) * edge
-    extent = (edges[0][0], edges[1][0], edges[0][1], edges[1][1])
-    image = left.imshow(
-        shown.T, origin="lower", extent=extent, norm=LogNorm(1, MAX_DENSITY), cmap="viridis", alpha=0.85, zorder=0.5
-    )
+    image = draw_visits(left, visits, maze)
     figure.colorbar(image, ax=left, label=f"visits (from {MAX_DENSITY} on alike)", extend="max")
-    if maze is not None:
-        left.set(xlim=maze.extent[:2], ylim=maze.extent[2:])
-    _label_axes(left)
     right.plot(*np.array(visits.coverage or [(0, 0)]).T)
     _count_steps(right)
     right.set(ylabel=f"known cells of {visits.cell_size:g} m", ylim=(0, None))
     return figure
+
+
+def draw_values(
+    axes: Any, positions: np.ndarray, values: np.ndarray, maze: Any = None, limits: tuple[float, float] | None = None
+) -> Any:
+    """
+    Values of places.
+
+    :param axes: Where
+    :param positions: Shape [N, position_dim]
+    :param values: Shape [N]
+    :param maze: An ``envs.Maze`` that is drawn below
+    :param limits: Of the colours; those of the values when None
+    :return: The image, for a colour bar
+    """
+    if maze is not None:
+        _draw_maze(axes, maze)
+    low, high = (values.min(), values.max()) if limits is None else limits
+    size = 30_000 / max(len(positions), 1) if maze is not None else 12
+    image = axes.scatter(*_in_plane(positions).T, c=values, s=size, marker="s", vmin=low, vmax=high, zorder=0.5)
+    _label_axes(axes)
+    return image
 
 
 def plot_values(model: Any, observations: np.ndarray, maze: Any = None, normalizer: Any = None) -> Figure:
@@ -208,21 +243,17 @@ def plot_values(model: Any, observations: np.ndarray, maze: Any = None, normaliz
     figure = _new(4.2 * n_columns, 3.8 * n_rows)
     grid = np.atleast_1d(figure.subplots(n_rows, n_columns, squeeze=False)).ravel()
     low, high = float(values.min()), float(values.max())
-    size = 30_000 / max(len(observations), 1) if maze is not None else 12
     image: Any = None
     for index, axes in enumerate(grid):
         if index >= len(modes):
             axes.axis("off")
             continue
-        if maze is not None:
-            _draw_maze(axes, maze)
-        image = axes.scatter(*positions.T, c=values[:, index], s=size, marker="s", vmin=low, vmax=high, zorder=0.5)
+        image = draw_values(axes, positions, values[:, index], maze, (low, high))
         if len(modes[index].representative):
             route = _in_plane(modes[index].representative)
             axes.plot(*route.T, color="w", lw=2.5, zorder=2)
             axes.plot(*route.T, color=mode_color(modes[index].number), lw=1.5, zorder=2)
         axes.set_title(modes[index].name)
-        _label_axes(axes)
     figure.colorbar(image, ax=grid.tolist(), label="value of the mode (discounted, scaled reward)")
     return figure
 

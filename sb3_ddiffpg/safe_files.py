@@ -95,6 +95,8 @@ def convert(tree: Any, schema: Any, what: str) -> Any:
         return msgspec.convert(tree, schema)
     except (msgspec.ValidationError, RecursionError) as error:
         raise ValueError(f"{what}: {error}") from None
+    except AttributeError as error:  # an array where a mapping belongs
+        raise ValueError(f"{what}: Expected `object`: {error}") from None
 
 
 def check_array(array: np.ndarray, dtype: Any, shape: Sequence[int | None], what: str) -> np.ndarray:

@@ -1,7 +1,10 @@
 """A recorded run says what it did, and can be done again."""
 
 import csv
+import re
+import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -9,21 +12,25 @@ import yaml
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.evaluation import ModeEvaluation
-from sb3_ddiffpg.experiments import run as runs
+from sb3_ddiffpg.experiments import __main__ as cli
+from sb3_ddiffpg.experiments.curve import CurveCallback
 
 SMALL = "{n_timesteps: 1600, learning_starts: 320, n_envs: 4, policy_kwargs: 'dict(net_arch=[16])'}"
 
 
+TESTS = "{n_tests: 3, n_test_episodes: 2, n_episodes: 3}"
+
+
 def record(monkeypatch, folder, *arguments):
-    monkeypatch.setattr(runs, "N_TESTS", 3)
-    monkeypatch.setattr(runs, "N_TEST_EPISODES", 2)
-    monkeypatch.setattr(runs, "N_EPISODES", 3)
-    monkeypatch.setattr(sys, "argv", ["run", *arguments, "--out", str(folder)])
-    runs.main()
+    if "--again" not in arguments:
+        arguments = (*arguments, "--tests", TESTS)
+    arguments = ["trial", *arguments, "--out", str(folder)]
+    monkeypatch.setattr(sys, "argv", ["experiments", *arguments])
+    cli.main(arguments)
     return yaml.safe_load((folder / "config.yml").read_text())
 
 
-def test_a_run_leaves_its_record_and_can_be_repeated(monkeypatch, tmp_path):
+def test_a_run_leaves_its_record_and_can_be_repeated(monkeypatch, tmp_path, capsys):
     first = record(monkeypatch, tmp_path / "a", "--env", "PointMazeV1-v0", "--seed", "5", "--override", SMALL)
     assert (first["env"], first["seed"], first["hyperparams"]["n_envs"]) == ("PointMazeV1-v0", 5, 4)
     assert first["result"]["steps"] == 1600 and first["versions"]["torch"] and first["machine"]["cores"] >= 1
@@ -39,25 +46,26 @@ def test_a_run_leaves_its_record_and_can_be_repeated(monkeypatch, tmp_path):
     models = [DDiffPG.load(tmp_path / name / "model.zip") for name in "ab"]
     for mine, other in zip(*(model.policy.parameters() for model in models), strict=True):
         np.testing.assert_array_equal(mine.detach().numpy(), other.detach().numpy())
-    with pytest.raises(SystemExit, match="holds another run already"):
+    with pytest.raises(SystemExit):
         record(monkeypatch, tmp_path / "a", "--env", "PointMazeV1-v0", "--seed", "6", "--override", SMALL)
+    assert "holds another training" in capsys.readouterr().err
 
 
 def test_a_run_that_was_killed_goes_on(monkeypatch, tmp_path):
     """With the same command, to the same end; and a complete one is left alone."""
     command = ("--env", "PointMazeV1-v0", "--override", SMALL)
     whole = record(monkeypatch, tmp_path / "a", *command)
-    on_period = runs.CurveCallback._on_period
+    on_period = CurveCallback._on_period
 
     def dies(self):
         on_period(self)
         if len(self.rows) == 2:
             raise KeyError("killed")
 
-    monkeypatch.setattr(runs.CurveCallback, "_on_period", dies)
+    monkeypatch.setattr(CurveCallback, "_on_period", dies)
     with pytest.raises(KeyError, match="killed"):
         record(monkeypatch, tmp_path / "b", *command)
-    monkeypatch.setattr(runs.CurveCallback, "_on_period", on_period)
+    monkeypatch.setattr(CurveCallback, "_on_period", on_period)
     assert "result" not in yaml.safe_load((tmp_path / "b" / "config.yml").read_text())
     resumed = record(monkeypatch, tmp_path / "b", *command)
     assert resumed["result"]["steps"] == whole["result"]["steps"] and resumed["result"]["complete"]
@@ -76,22 +84,31 @@ def test_a_run_that_was_killed_goes_on(monkeypatch, tmp_path):
     assert sorted(path.name for path in (tmp_path / "b" / "logs").glob("*.monitor.csv")) == ["0.monitor.csv", "1.monitor.csv"]
 
 
-def test_settings_that_do_not_exist(monkeypatch, tmp_path):
-    with pytest.raises(SystemExit, match="PointMazeV9-v0.*PointMazeV1-v0"):
-        record(monkeypatch, tmp_path, "--env", "PointMazeV9-v0")
-    with pytest.raises(SystemExit, match="--env or --again"):
-        record(monkeypatch, tmp_path)
-    with pytest.raises(SystemExit, match="folder of a recorded run"):
-        record(monkeypatch, tmp_path, "--again", str(tmp_path / "none"))
-    with pytest.raises(SystemExit, match="nope.*YAML file"):
-        record(monkeypatch, tmp_path, "--algo", "nope", "--env", "PointMazeV1-v0")
-    with pytest.raises(SystemExit, match="nope.*ddiffpg"):
-        record(monkeypatch, tmp_path, "--algo", "nope", "--conf-file", "ddiffpg", "--env", "PointMazeV1-v0")
-    with pytest.raises(SystemExit, match="registered"):
-        record(monkeypatch, tmp_path, "--env", "paper")
-    for override in ("5", "", "{"):
+def test_settings_that_do_not_exist(monkeypatch, tmp_path, capsys):
+    point = ("--env", "PointMazeV1-v0")
+    for arguments, said in (
+        (("--env", "PointMazeV9-v0"), "PointMazeV9-v0.*PointMazeV1-v0"),
+        ((), "--env or --again"),
+        (("--again", str(tmp_path / "none")), "folder of a recorded training"),
+        (("--algo", "nope", *point), "nope.*ddiffpg"),
+        ((*point, "--conf-file", "nope"), "nope.*YAML file"),
+        (("--env", "paper"), "registered"),
+        ((*point, "--override", "5"), "accepted are settings"),
+        ((*point, "--override", ""), "accepted are settings"),
+        ((*point, "--override", "{"), "no YAML"),
+        ((*point, "--override", "{lerning_rate: 1}"), "did you mean 'learning_rate'"),
+        ((*point, "--override", "{n_timesteps: 0}"), "n_timesteps: 0 given"),
+        ((*point, "--override", "{n_timesteps: .nan}"), "n_timesteps: nan given"),
+        ((*point, "--settings", "{gamma: 1}", "--override", "{gamma: 1}"), "one or the other"),
+        ((*point, "--members", "0"), "members: 0 given"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            record(monkeypatch, tmp_path / "run", *arguments)
+        assert ended.value.code == 2
+        assert re.search(said, capsys.readouterr().err, re.DOTALL), said
+    for tests in ("{n_episodes: 0}", "{episodes: 1}", "{also: [Nowhere-v0]}"):
         with pytest.raises(SystemExit):
-            record(monkeypatch, tmp_path, "--env", "PointMazeV1-v0", "--override", override)
+            cli.main(["trial", *point, "--tests", tests, "--out", str(tmp_path / "run")])
     assert not list(tmp_path.iterdir())
 
 
@@ -99,3 +116,41 @@ def test_the_best_model_comes_with_its_normalisation(monkeypatch, tmp_path):
     settings = SMALL.replace("1600", "1e3").replace("{", "{normalize: {norm_obs: true, norm_reward: false}, ")
     done = record(monkeypatch, tmp_path / "run", "--env", "PointMazeV1-v0", "--override", settings)
     assert done["result"]["complete"] and (tmp_path / "run" / "vecnormalize.pkl").is_file()
+
+
+def test_a_union_shares_the_steps(monkeypatch, tmp_path):
+    """Three trainings of a third each, evaluated as one model with a mode for each; it goes on where it was killed."""
+    settings = SMALL.replace("1600", "2400").replace("n_envs: 4", "n_envs: 4, n_steps: 1")
+    command = ("--algo", "td3_c51", "--env", "PointMazeV1-v0", "--seed", "2", "--members", "3", "--override", settings)
+    done = record(monkeypatch, tmp_path, *command)
+    members = [yaml.safe_load((tmp_path / f"member_{k}" / "config.yml").read_text()) for k in range(3)]
+    assert [member["seed"] for member in members] == [6, 7, 8]
+    assert done["result"]["steps"] == sum(member["result"]["steps"] for member in members) == 2400
+    found = ModeEvaluation.load(tmp_path / "evaluation.json")
+    assert [each.mode for each in found.commanded] == ["model_0", "model_1", "model_2"]
+    before = (tmp_path / "member_0" / "model.zip").stat().st_mtime_ns
+    (tmp_path / "config.yml").write_text(yaml.safe_dump({k: v for k, v in done.items() if k != "result"}))
+    assert record(monkeypatch, tmp_path, *command)["result"] == done["result"]
+    assert (tmp_path / "member_0" / "model.zip").stat().st_mtime_ns == before
+
+
+def test_what_was_trained_is_tested_elsewhere_too(monkeypatch, tmp_path):
+    tests = "{n_tests: 1, n_test_episodes: 2, n_episodes: 3, also: [PointMazeRandom-v0]}"
+    cli.main(["trial", "--env", "PointMazeV3-v0", "--override", SMALL, "--tests", tests, "--out", str(tmp_path)])
+    found = ModeEvaluation.load(tmp_path / "evaluation_PointMazeRandom-v0.json")
+    assert found.env_id == "PointMazeRandom-v0" and found.uncommanded.n_episodes == 3 and not found.commanded
+
+
+def test_a_trial_ends_with_the_process_that_started_it(tmp_path):
+    """Its standard input closes: it writes a checkpoint and ends."""
+    command = [sys.executable, "-m", "sb3_ddiffpg.experiments", "trial", "--env", "PointMazeV1-v0", "--attached"]
+    command += ["--override", SMALL.replace("1600", "1e8"), "--tests", TESTS, "--out", str(tmp_path)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "logs" / "progress.json").exists():
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.1)
+    process.stdin.close()
+    assert process.wait(60) == 1
+    assert "the same command goes on" in process.stderr.read()
+    assert list((tmp_path / "logs" / "checkpoints").glob("*.safetensors"))

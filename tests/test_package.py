@@ -62,7 +62,9 @@ def test_wheel_holds_every_file_of_the_package(wheel):
         built = set(archive.namelist())
     expected = {path.relative_to(ROOT).as_posix() for path in (ROOT / "sb3_ddiffpg").rglob("*.py")}
     expected |= {f"sb3_ddiffpg/zoo_hyperparams/{path.name}" for path in (ROOT / "zoo_hyperparams").iterdir()}
-    expected |= {"sb3_ddiffpg/py.typed", "sb3_ddiffpg/templates/report.html"}
+    data = [ROOT / "sb3_ddiffpg" / "py.typed", ROOT / "sb3_ddiffpg" / "experiments" / "paper.yml"]
+    data += [*(ROOT / "sb3_ddiffpg" / "templates").iterdir(), *(ROOT / "sb3_ddiffpg" / "experiments" / "suites").iterdir()]
+    expected |= {path.relative_to(ROOT).as_posix() for path in data}
     assert {name for name in built if ".dist-info/" not in name} == expected
     assert any(name.endswith("LICENSE") for name in built)
 
@@ -75,8 +77,9 @@ def test_metadata(wheel):
     assert metadata["Name"] == "sb3_ddiffpg"
     assert metadata["License-Expression"] == "MIT"
     assert set(metadata["Requires-Python"].split(",")) == {">=3.11", "<3.13"}
-    assert set(metadata.get_all("Provides-Extra")) == {"franka", "zoo", "plots", "cluster", "dev", "all"}
+    assert set(metadata.get_all("Provides-Extra")) == {"franka", "zoo", "plots", "hub", "cluster", "dev", "all"}
     assert "ddiffpg = sb3_ddiffpg.zoo:main" in scripts
+    assert "ddiffpg-experiments = sb3_ddiffpg.experiments.__main__:main" in scripts
     pybullet = [Requirement(line) for line in metadata.get_all("Requires-Dist") if line.startswith("pybullet")]
     assert [requirement.marker.evaluate({"python_version": "3.12", "extra": "franka"}) for requirement in pybullet] == [False]
 

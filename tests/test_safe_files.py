@@ -21,7 +21,7 @@ from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.model_file import build_model, model_tree
 from sb3_ddiffpg.plain_values import from_plain, to_plain
-from sb3_ddiffpg.safe_files import read, write
+from sb3_ddiffpg.safe_files import convert, read, write
 from sb3_ddiffpg.schedules import LateLinearSchedule
 
 PLAIN = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
@@ -292,6 +292,11 @@ def mutate(tree, data):
         node.pop(key)
     else:
         node[key] = new
+
+
+def test_an_array_where_a_mapping_belongs():
+    with pytest.raises(ValueError, match="it: Expected `object`"):
+        convert(np.zeros(3), dict[str, int], "it")
 
 
 @given(data=st.data())

@@ -104,6 +104,13 @@ class DIPO(Baseline):
     def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
         if self.own_policy_batch:
             batch = self.replay_buffer.sample_modes(batch.rows.size, self.gamma, 1, 1, env=self._vec_normalize_env)
+        improved = self._improve_target_actions(batch)
+        metrics["target_action_shift"].append((improved - batch.target_actions).abs().mean())
+        condition = self.actor.condition(batch.observations)
+        metrics["actor_loss"].append(self._step_actor(self.actor.diffusion.loss(improved.flatten(0, 1), condition)))
+
+    def _improve_target_actions(self, batch: ModeBatch) -> th.Tensor:
+        """They climb the critics, and return to the buffer. [1, n, action_dim]"""
         with th.no_grad():
             features = self.policy.critic_features(batch.observations)
         gradient = self.policy.critics.action_gradient(features)
@@ -112,9 +119,7 @@ class DIPO(Baseline):
             gradient = partial(_limited, gradient, limit)
         improved = ascend(gradient, batch.target_actions, self.action_lr, self.n_action_gradient_steps, self.action_optimizer)
         self.replay_buffer.store_target_actions(batch, improved)
-        metrics["target_action_shift"].append((improved - batch.target_actions).abs().mean())
-        condition = self.actor.condition(batch.observations)
-        metrics["actor_loss"].append(self._step_actor(self.actor.diffusion.loss(improved.flatten(0, 1), condition)))
+        return improved
 
 
 def _limited(gradient: Any, limit: float, actions: th.Tensor) -> th.Tensor:

@@ -497,6 +497,10 @@ class RPG(NoveltyActorCritic):
 
     # ------------------------------------------------------------------ acting
 
+    def _values_of_drawn_actions(self, obs: Any) -> th.Tensor:
+        states = self.policy.encode(obs)  # its values know no action, but a latent variable
+        return self.policy.model.values(states, self.policy.draw_latents(len(states))).amin(dim=0)
+
     def _begin_episodes(self) -> None:
         self._episode_latents = self.policy.draw_latents(self.n_envs).cpu().numpy()
 

@@ -1,1 +1,3 @@
-"""Experiments that leave a record: one run, its settings, curve, model and evaluation."""
+"""
+Trainings that leave a record, many of them by one command, and what they come to: ``python -m sb3_ddiffpg.experiments``.
+"""

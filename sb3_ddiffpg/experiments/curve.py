@@ -1,0 +1,106 @@
+"""A training's learning curve: tests along the way, and what had been reached by then."""
+
+import csv
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from sb3_ddiffpg.callbacks import EvaluateModesCallback
+from sb3_ddiffpg.experiments.wall_clock import Stopwatch
+from sb3_ddiffpg.safe_files import convert
+from sb3_ddiffpg.trajectories import read_success
+
+
+class Clock:
+    """
+    Hours since a run began, without those between a kill and its resumption.
+
+    :param hours: So many before
+    :param cpu_hours: So many of all processors before
+    """
+
+    def __init__(self, hours: float = 0.0, cpu_hours: float = 0.0) -> None:
+        self._began, self._cpu = time.perf_counter() - 3600 * hours, time.process_time() - 3600 * cpu_hours
+
+    @property
+    def hours(self) -> float:
+        """Of the clock on the wall."""
+        return (time.perf_counter() - self._began) / 3600
+
+    @property
+    def cpu_hours(self) -> float:
+        """Of this process."""
+        return (time.process_time() - self._cpu) / 3600
+
+
+class CurveCallback(EvaluateModesCallback):
+    """
+    Keeps the best model so far, and a line of ``curve.csv`` for each test of it.
+
+    :param folder: Of the run
+    :param kwargs: Of ``EvaluateModesCallback``
+    """
+
+    def __init__(self, folder: Path, **kwargs: Any) -> None:
+        super().__init__(path=folder / "logs" / "evaluations.jsonl", best_model_path=folder / "model.zip", **kwargs)
+        self.folder = folder
+        #: Goals reached in training, by the environment's label of the way
+        self.reached: Counter[str] = Counter()
+        self.rows: list[dict[str, Any]] = []
+        self.clock = Clock()
+        self.stopwatch = Stopwatch()
+
+    def _on_step(self) -> bool:
+        for done, info in zip(self.locals["dones"], self.locals["infos"], strict=True):
+            if done and info.get("mode") is not None and read_success(info, getattr(self.model, "success_key", None)):
+                self.reached[str(info["mode"])] += 1
+        return super()._on_step()
+
+    def _on_training_end(self) -> None:
+        if not self.evaluations or self.evaluations[-1][0] < self.num_timesteps:
+            self._on_period()
+
+    def _on_period(self) -> None:
+        super()._on_period()
+        step, found = self.evaluations[-1]
+        row: dict[str, Any] = {
+            "step": step,
+            "hours": round(self.clock.hours, 4),
+            "cpu_hours": round(self.clock.cpu_hours, 4),
+            "updates": self.model._n_updates,
+            "cells": len(visits) if (visits := getattr(self.model, "visits", None)) is not None else "",
+            "modes": len(getattr(self.model, "modes", ())),
+            "commanded_modes": round(found.commanded_modes, 3),
+            "expected_modes": round(found.expected_modes(), 3),
+            "robust_modes": found.robust_modes,
+            "success_rate": round(found.uncommanded.success_rate, 3),
+        }
+        for label in found.listed:
+            shares = [each.labels.get(label, 0) / each.n_episodes for each in (*found.commanded, found.uncommanded)]
+            row[label] = round(max(shares), 3)
+            row[f"reached {label}"] = self.reached[label]
+        self.rows.append(row)
+        with (self.folder / "curve.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(row))
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: What a resumed run must know, for ``load_state_dict``
+        """
+        clock = [self.clock.hours, self.clock.cpu_hours]
+        own = {"reached": dict(self.reached), "rows": self.rows, "clock": clock, "seconds": self.stopwatch.seconds}
+        return {**super().state_dict(), **own}
+
+    def load_state_dict(self, state: Any) -> None:
+        """
+        :param state: What ``state_dict`` gave
+        :raises ValueError: If it is something else
+        """
+        super().load_state_dict(state)
+        self.reached = Counter(convert(state.get("reached"), dict[str, int], "callback.reached"))
+        self.rows = convert(state.get("rows"), list[dict[str, Any]], "callback.rows")
+        self.clock = Clock(*convert(state.get("clock"), tuple[float, float], "callback.clock"))
+        self.stopwatch.seconds.update(convert(state.get("seconds"), dict[str, float], "callback.seconds"))

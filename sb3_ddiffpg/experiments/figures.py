@@ -1,0 +1,211 @@
+"""The paper's figures, from recorded trainings."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import seaborn as sns
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from sb3_ddiffpg import plots
+from sb3_ddiffpg.envs import make_vec_env
+from sb3_ddiffpg.experiments.store import Recorded, by, task_of, variant_of
+from sb3_ddiffpg.experiments.summary import MEASURES, over_tasks
+from sb3_ddiffpg.experiments.wall_clock import PARTS
+from sb3_ddiffpg.zoo import ALGOS
+
+# Places on the horizontal axis, to which every training's tests are interpolated
+_N_PLACES = 60
+_LABELS = {
+    "success_rate": "success, uncommanded",
+    "expected_modes": "modes expected in 20 episodes",
+    "commanded_modes": "modes that can be commanded",
+    "cells": "known cells",
+}
+
+
+def palette(runs: Sequence[Recorded]) -> dict[str, Any]:
+    """
+    :param runs: Trainings
+    :return: Variant -> its colour in all figures
+    """
+    names = list(by(variant_of, runs))
+    return dict(zip(names, sns.color_palette("tab10" if len(names) <= 10 else "tab20", len(names)), strict=True))
+
+
+def curves(runs: Sequence[Recorded], measure: str, against: str = "step") -> Figure:
+    """
+    A measure along training, for each task: the mean over seeds, between the lowest and the highest.
+
+    :param runs: Trainings
+    :param measure: Column of their curves, such as ``"success_rate"``
+    :param against: ``"step"`` or ``"hours"``
+    :return: The figure
+    """
+    tasks = by(task_of, [run for run in runs if measure in run.curve and run.curve[measure].notna().any()])
+    figure, panels = _panels(len(tasks))
+    colors = palette(runs)
+    for axes, (task, own) in zip(panels, tasks.items(), strict=True):
+        data = pd.concat([_interpolated(each, measure, against) for each in by(variant_of, own).values()], ignore_index=True)
+        sns.lineplot(data, x=against, y=measure, hue="variant", palette=colors, ax=axes, errorbar=("pi", 100))
+        axes.set(title=task, xlabel={"step": "environment steps"}.get(against, against), ylabel=_LABELS.get(measure, measure))
+        axes.set_ylim(0, 1.03 if measure == "success_rate" else None)
+        if against == "step":
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.get_legend().remove()
+    _one_legend(figure, panels, colors)
+    return figure
+
+
+def _interpolated(runs: Sequence[Recorded], measure: str, against: str) -> pd.DataFrame:
+    """Seeds need not have been tested at the same steps."""
+    places = np.linspace(0, min(run.curve[against].max() for run in runs), _N_PLACES)
+    parts = []
+    for run in runs:
+        known = run.curve[[against, measure]].dropna()
+        # Before its first test nothing had been reached
+        xs, ys = np.append(0, known[against]), np.append(0, known[measure])
+        parts.append(pd.DataFrame({against: places, measure: np.interp(places, xs, ys), "variant": variant_of(run)}))
+    return pd.concat(parts, ignore_index=True)
+
+
+def aggregate(runs: Sequence[Recorded], measures: Sequence[str] = ("success", "coverage")) -> Figure:
+    """
+    Interquartile means over all tasks and seeds.
+
+    :param runs: Trainings
+    :param measures: Of ``summary.MEASURES``
+    :return: The figure
+    """
+    colors = palette(runs)
+    figure = Figure(figsize=(4.5 * len(measures), 1 + 0.35 * len(colors)), layout="constrained")
+    panels = figure.subplots(1, len(measures), sharey=True, squeeze=False)[0]
+    for axes, measure in zip(panels, measures, strict=True):
+        for variant, (mean, low, high) in reversed(over_tasks(runs, measure).items()):
+            axes.barh(variant, high - low, left=low, color=colors[variant], alpha=0.6, height=0.6)
+            axes.plot([mean, mean], [variant, variant], marker="|", markersize=14, color="k")
+        axes.set(title=f"{measure}: interquartile mean", xlim=(0, 1.02))
+    return figure
+
+
+def ablation(runs: Sequence[Recorded], setting: str) -> Figure:
+    """
+    What the final model comes to, over the values of a setting.
+
+    :param runs: Trainings that differ in it
+    :param setting: Its name
+    :return: The figure
+    """
+    measures = ("success", "modes in 20")
+    figure, panels = _panels(len(measures))
+    for axes, measure in zip(panels, measures, strict=True):
+        rows = [(run.trial.hyperparams[setting], MEASURES[measure](run.evaluation), task_of(run)) for run in runs]
+        data = pd.DataFrame(rows, columns=[setting, measure, "task"])
+        sns.lineplot(data, x=setting, y=measure, hue="task", marker="o", ax=axes, errorbar=("pi", 100))
+        axes.set(xscale="log", xticks=(values := sorted(data[setting].unique())), ylim=(0, None))
+        axes.set_xticks(values, [f"{value:g}" for value in values])
+        axes.minorticks_off()
+    return figure
+
+
+def wall_clock(runs: Sequence[Recorded]) -> Figure:
+    """
+    Seconds for 1000 updates and the collection between them, in the paper's four parts.
+
+    :param runs: Trainings
+    :return: The figure
+    """
+    timed = [run for run in runs if run.result.get("seconds") and run.result.get("updates")]
+    rows = {
+        variant: pd.DataFrame([run.result["seconds"] for run in own]).sum() / sum(run.result["updates"] for run in own) * 1000
+        for variant, own in by(variant_of, timed).items()
+    }
+    figure = Figure(figsize=(8, 1.2 + 0.4 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    if rows:
+        data = pd.DataFrame(rows).T[list(PARTS)].iloc[::-1]
+        data.plot.barh(stacked=True, ax=axes, width=0.7, legend=False)
+        figure.legend(loc="outside upper center", ncols=len(PARTS))
+        axes.set_xlabel("seconds for 1000 updates")
+    return figure
+
+
+class Maps:
+    """
+    Where each variant's training went, and what its critics expect, in the maze of one task.
+
+    :param runs: Trainings of one task, of which the first of each variant is shown
+    """
+
+    def __init__(self, runs: Sequence[Recorded]) -> None:
+        firsts = {variant: own[0] for variant, own in by(variant_of, runs).items()}
+        shown = {variant: run for variant, run in firsts.items() if (run.folder / "model.zip").is_file()}
+        self.colors = palette(runs)
+        self.models: dict[str, Any] = {
+            variant: ALGOS[run.trial.algo].load(_final_model(run)) for variant, run in shown.items()
+        }
+        first = runs[0]
+        env = make_vec_env(task_of(first), 1, seed=0, **first.trial.hyperparams.get("env_kwargs", {}))
+        self.maze = env.get_attr("maze", indices=0)[0] if env.has_attr("maze") else None
+        self.observation: Any = env.reset()
+        env.close()
+
+    def exploration(self) -> Figure | None:
+        """
+        :return: Visits by cell; None where none were counted
+        """
+        visited = {variant: model.visits for variant, model in self.models.items() if getattr(model, "visits", None)}
+        if self.maze is None or not visited:
+            return None
+        figure, panels = _panels(len(visited))
+        for axes, (variant, visits) in zip(panels, visited.items(), strict=True):
+            image = plots.draw_visits(axes, visits, self.maze)
+            axes.set_title(f"{variant}: {len(visits)} cells")
+        figure.colorbar(image, ax=panels, label=f"visits (from {plots.MAX_DENSITY} on alike)", extend="max")
+        return figure
+
+    def values(self) -> Figure | None:
+        """
+        :return: ``state_values`` all over the maze, of DDiffPG those of the best mode; None where there is no maze
+        """
+        if self.maze is None or isinstance(self.observation, dict):
+            return None
+        shown = {
+            variant: model
+            for variant, model in self.models.items()
+            if isinstance(model.replay_buffer.features.selection, np.ndarray) and not model.is_normalized
+        }
+        if not shown:
+            return None
+        figure, panels = _panels(len(shown))
+        for axes, (variant, model) in zip(panels, shown.items(), strict=True):
+            places = plots.grid_observations(model, self.observation[0], self.maze)
+            image = plots.draw_values(axes, model.replay_buffer.features(places), model.state_values(places), self.maze)
+            figure.colorbar(image, ax=axes)
+            axes.set_title(variant)
+        return figure
+
+
+def _final_model(run: Recorded) -> Any:
+    """It has seen all of training; where it was not kept, the best one."""
+    final = run.folder / "logs" / "final_model.zip"
+    return final if final.is_file() else run.folder / "model.zip"
+
+
+def _panels(n: int) -> tuple[Figure, list[Any]]:
+    n_columns = min(4, max(n, 1))
+    n_rows = -(-max(n, 1) // n_columns)
+    figure = Figure(figsize=(4.4 * n_columns, 3.6 * n_rows), layout="constrained")
+    grid = figure.subplots(n_rows, n_columns, squeeze=False).ravel().tolist()
+    for axes in grid[n:]:
+        axes.axis("off")
+    return figure, grid[:n]
+
+
+def _one_legend(figure: Figure, panels: Sequence[Any], colors: dict[str, Any]) -> None:
+    if not panels:
+        return
+    handles = [panels[0].plot([], [], color=color)[0] for color in colors.values()]
+    figure.legend(handles, list(colors), loc="outside lower center", ncols=min(4, len(colors)))

@@ -1,0 +1,159 @@
+"""What a folder of results comes to: tables and figures, as Markdown beside PNG files and as one page of HTML."""
+
+import argparse
+import base64
+import re
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import markdown
+import pandas as pd
+from matplotlib.figure import Figure
+
+from sb3_ddiffpg.experiments import figures
+from sb3_ddiffpg.experiments.store import Recorded, by, read_results, task_of, variant_of
+from sb3_ddiffpg.experiments.summary import elsewhere_table, task_table
+from sb3_ddiffpg.zoo import register
+
+_IMAGE = re.compile(r'src="([^":]+\.png)"')
+
+
+def make_report(results: Path, output: Path, title: str, ablation: str | None = None) -> Path:
+    """
+    :param results: Folder in which trainings have left their records
+    :param output: Folder of the report
+    :param title: Of the report
+    :param ablation: Setting in which the variants differ, for a figure over its values
+    :return: The page, ``report.html``; ``report.md`` and the PNG files lie beside it
+    :raises ValueError: If no training is complete
+    """
+    runs, incomplete = read_results(results)
+    if not runs:
+        raise ValueError(f"results: none of the {len(incomplete)} trainings in {results} is complete")
+    output.mkdir(parents=True, exist_ok=True)
+    drawn = _Drawn(output)
+    _draw(drawn, runs, ablation)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sb3_ddiffpg"), undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    elsewhere = elsewhere_table(runs)
+    text = environment.get_template("results.md").render(
+        title=title,
+        machines=_machines(runs),
+        incomplete=[str(folder.relative_to(results)) for folder in incomplete],
+        tasks={task: _table(task_table(own)) for task, own in by(task_of, runs).items()},
+        elsewhere=None if elsewhere.empty else _table(elsewhere),
+        figures=drawn.captions,
+        commands=_commands(runs),
+    )
+    (output / "report.md").write_text(text)
+    body = markdown.markdown(text, extensions=["tables"])
+    body = _IMAGE.sub(lambda found: f'src="data:image/png;base64,{_encoded(output / found[1])}"', body)
+    page = environment.get_template("results.html").render(title=title, body=body)
+    (output / "report.html").write_text(page)
+    return output / "report.html"
+
+
+class _Drawn:
+    """
+    Figures that were written.
+
+    :param folder: Of the files
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        #: File -> what it shows
+        self.captions: dict[str, str] = {}
+
+    def add(self, name: str, caption: str, figure: Figure | None) -> None:
+        """
+        :param name: Of the file, without ending
+        :param caption: What it shows
+        :param figure: The figure; None if there is nothing to show
+        """
+        if figure is not None:
+            figure.savefig(self.folder / f"{name}.png", dpi=90)
+            self.captions[f"{name}.png"] = caption
+
+
+def _draw(drawn: _Drawn, runs: Sequence[Recorded], setting: str | None) -> None:
+    for measure, name in (
+        ("success_rate", "Success without command"),
+        ("expected_modes", "Ways expected in 20 episodes without command"),
+        ("commanded_modes", "Ways that can be commanded"),
+        ("cells", "Known cells"),
+    ):
+        if any(measure in run.curve for run in runs):
+            text = f"{name} along training: mean over seeds, between the lowest and the highest."
+            drawn.add(measure, text, figures.curves(runs, measure))
+    if any(len(run.curve) for run in runs):
+        drawn.add(
+            "success_rate_hours", "Success without command against hours.", figures.curves(runs, "success_rate", "hours")
+        )
+    if len(by(task_of, runs)) > 1:
+        drawn.add("aggregate", "Over all tasks and seeds, stratified bootstrap.", figures.aggregate(runs))
+    if setting is not None:
+        drawn.add("ablation", f"The final models over {setting}.", figures.ablation(runs, setting))
+    if any(run.result.get("seconds") for run in runs):
+        drawn.add("wall_clock", "Time of 1000 updates and the collection between them, by part.", figures.wall_clock(runs))
+    for task, own in by(task_of, runs).items():
+        maps = figures.Maps(own)
+        drawn.add(f"exploration_{task}", f"{task}: where training went (first seed).", maps.exploration())
+        drawn.add(f"values_{task}", f"{task}: what the critics expect, of DDiffPG those of the best mode.", maps.values())
+
+
+def _table(frame: pd.DataFrame) -> str:
+    rows = [list(frame.columns), ["---"] * len(frame.columns), *frame.astype(str).to_numpy().tolist()]
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _machines(runs: Sequence[Recorded]) -> list[str]:
+    found = {
+        f"{run.record['machine']['gpu'] or run.record['machine']['processor']}, {run.record['machine']['cores']} cores, "
+        f"{run.record['machine']['torch_threads']} threads each, commit {run.record['git_commit']}, "
+        + ", ".join(f"{name} {version}" for name, version in run.record["versions"].items())
+        for run in runs
+    }
+    return sorted(found)
+
+
+def _commands(runs: Sequence[Recorded]) -> dict[str, str]:
+    """How the first training of each variant can be done again."""
+    firsts = {variant: own[0] for variant, own in by(variant_of, runs).items()}
+    return {
+        variant: f"python -m sb3_ddiffpg.experiments trial --again {run.folder} --out DIR" for variant, run in firsts.items()
+    }
+
+
+def _encoded(path: Path) -> str:
+    return base64.b64encode(path.read_bytes()).decode()
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: Of the command line
+    """
+    parser.add_argument("results", type=Path, help="folder in which trainings have left their records")
+    parser.add_argument("--out", type=Path, help="folder of the report; RESULTS/report if not given")
+    parser.add_argument("--title", help="the name of the folder of results if not given")
+    parser.add_argument("--ablation", metavar="SETTING", help="in which the variants differ, for a figure over its values")
+
+
+def prepare(given: argparse.Namespace) -> Callable[[], Any]:
+    """
+    :param given: The command line
+    :return: What does it
+    :raises ValueError: If it asks for what there is not
+    """
+    register()
+    read_results(given.results)
+    return partial(_report, given)
+
+
+def _report(given: argparse.Namespace) -> None:
+    output = given.out or given.results / "report"
+    print(f"wrote {make_report(given.results, output, given.title or given.results.resolve().name, given.ablation)}")

@@ -1,0 +1,126 @@
+"""A folder of recorded trainings, read."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+
+from sb3_ddiffpg.evaluation import ModeEvaluation
+from sb3_ddiffpg.experiments.trial import Trial, recorded_trial
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """
+    A complete training.
+
+    :param folder: Of its record
+    :param trial: What was trained
+    :param record: All of ``config.yml``
+    :param curve: Its tests, one a row; empty for a union
+    :param evaluation: Of the best model
+    :param elsewhere: Of the same in further environments, by id
+    """
+
+    folder: Path
+    trial: Trial
+    record: dict[str, Any]
+    curve: pd.DataFrame
+    evaluation: ModeEvaluation
+    elsewhere: dict[str, ModeEvaluation]
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """What it took."""
+        return self.record["result"]
+
+
+def read_results(folder: Path) -> tuple[list[Recorded], list[Path]]:
+    """
+    :param folder: In which trainings have left their records, at whatever depth
+    :return: The complete ones, and the folders of the others
+    :raises ValueError: If there is none at all
+    """
+    complete, others = [], []
+    for place, folders, files in os.walk(folder):
+        folders.sort()
+        if "config.yml" not in files or (record := _record(Path(place))) is None:
+            continue
+        folders.clear()  # what lies below are members of a union, and logs
+        recorded = _read(Path(place), record)
+        if recorded is None:
+            others.append(Path(place))
+        else:
+            complete.append(recorded)
+    if not complete and not others:
+        raise ValueError(f"results: {folder} given; accepted is a folder in which trainings have left their records")
+    return complete, others
+
+
+def read_training(folder: Path) -> Recorded:
+    """
+    :param folder: Of a complete training
+    :return: The training
+    :raises ValueError: If it is no such folder
+    """
+    record = _record(folder) if (folder / "config.yml").is_file() else None
+    found = None if record is None else _read(folder, record)
+    if found is None:
+        raise ValueError(f"{folder} given; accepted is the folder of a complete training")
+    return found
+
+
+def _record(folder: Path) -> dict[str, Any] | None:
+    """None if the file is somebody else's: the zoo's have the same name."""
+    try:
+        record = yaml.safe_load((folder / "config.yml").read_text())
+    except yaml.YAMLError:
+        return None
+    return record if isinstance(record, dict) and {"algo", "env", "seed", "hyperparams"} <= set(record) else None
+
+
+def _read(folder: Path, record: dict[str, Any]) -> Recorded | None:
+    if not record.get("result", {}).get("complete") or not (folder / "evaluation.json").is_file():
+        return None
+    curve = folder / "curve.csv"
+    elsewhere = sorted(folder.glob("evaluation_*.json"))
+    return Recorded(
+        folder,
+        recorded_trial(folder),
+        record,
+        pd.read_csv(curve) if curve.is_file() else pd.DataFrame(),
+        ModeEvaluation.load(folder / "evaluation.json"),
+        {path.stem.removeprefix("evaluation_"): ModeEvaluation.load(path) for path in elsewhere},
+    )
+
+
+def by(key: Callable[[Recorded], str], runs: Sequence[Recorded]) -> dict[str, list[Recorded]]:
+    """
+    :param key: What is to be alike
+    :param runs: Trainings
+    :return: Those that are alike, in the order in which they come first
+    """
+    found: dict[str, list[Recorded]] = {}
+    for run in runs:
+        found.setdefault(key(run), []).append(run)
+    return found
+
+
+def task_of(run: Recorded) -> str:
+    """
+    :param run: A training
+    :return: Where
+    """
+    return run.trial.env
+
+
+def variant_of(run: Recorded) -> str:
+    """
+    :param run: A training
+    :return: Of what
+    """
+    return run.trial.variant

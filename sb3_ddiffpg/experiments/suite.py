@@ -1,0 +1,145 @@
+"""Suites: tasks times variants of algorithms times seeds, declared in a YAML file."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import yaml
+
+from sb3_ddiffpg.experiments.trial import Tests, Trial, hyperparameters
+from sb3_ddiffpg.zoo import ALGO
+
+SUITES = Path(__file__).parent / "suites"
+
+
+class Variant(msgspec.Struct, forbid_unknown_fields=True):
+    """
+    An algorithm with settings of its own.
+
+    :param algo: Name in the zoo
+    :param conf_file: YAML file of settings; the suite's when None, else the algorithm's own
+    :param settings: What differs from its entry there
+    :param members: More than one: see ``Trial``
+    """
+
+    algo: str = ALGO
+    conf_file: str | None = None
+    settings: dict[str, Any] = {}
+    members: int = 1
+
+
+class Resources(msgspec.Struct, forbid_unknown_fields=True):
+    """
+    What one trial takes of a machine.
+
+    :param cpus: Processor cores, and threads of PyTorch
+    :param gpus: Accelerators, or a share of one
+    """
+
+    cpus: int = 1
+    gpus: float = 0.0
+
+
+class Suite(msgspec.Struct, forbid_unknown_fields=True):
+    """
+    What is trained, and how it is tested.
+
+    :param description: One line
+    :param tasks: Id of an environment -> settings for all variants there
+    :param variants: Name -> what it is
+    :param seeds: Their seeds
+    :param settings: For all
+    :param conf_file: YAML file of settings for all variants that name no other
+    :param tests: How each is tested
+    :param also: Task -> further environments in which what was trained there is evaluated
+    :param resources: What one trial takes
+    :param ablation: The setting in which the variants differ, for a figure over its values
+    """
+
+    description: str
+    tasks: dict[str, dict[str, Any] | None]
+    variants: dict[str, Variant]
+    seeds: list[int]
+    settings: dict[str, Any] = {}
+    conf_file: str | None = None
+    tests: Tests = msgspec.field(default_factory=Tests)
+    also: dict[str, list[str]] = {}
+    resources: Resources = msgspec.field(default_factory=Resources)
+    ablation: str | None = None
+
+    def trials(self) -> dict[Path, Trial]:
+        """
+        :return: Folder below the results -> trial; all of the first seed come first, so that there is something of everything
+            soon
+        :raises ValueError: If one cannot be
+        """
+        found = {}
+        for seed in self.seeds:
+            for task in self.tasks:
+                for name in self.variants:
+                    trial = self._trial(task, name, seed)
+                    if seed == self.seeds[0]:
+                        trial.check()
+                    found[Path(task, name.replace("/", "-"), f"seed{seed}")] = trial
+        return found
+
+    def _trial(self, task: str, name: str, seed: int) -> Trial:
+        variant = self.variants[name]
+        changes = {**self.settings, **(self.tasks[task] or {}), **variant.settings}
+        return Trial(
+            env=task,
+            algo=variant.algo,
+            variant=name,
+            seed=seed,
+            hyperparams=hyperparameters(variant.algo, task, variant.conf_file or self.conf_file, changes),
+            members=variant.members,
+            tests=msgspec.structs.replace(self.tests, also=[*self.tests.also, *self.also.get(task, [])]),
+        )
+
+
+def suite_names() -> list[str]:
+    """
+    :return: Names of the suites in the package
+    """
+    return sorted(path.stem for path in SUITES.glob("*.yml"))
+
+
+def read_suite(
+    name: str,
+    tasks: Sequence[str] | None = None,
+    variants: Sequence[str] | None = None,
+    seeds: Sequence[int] | None = None,
+) -> Suite:
+    """
+    :param name: Of a suite in the package, or path of a YAML file
+    :param tasks: Only these of its tasks
+    :param variants: Only these of its variants
+    :param seeds: Instead of its seeds
+    :return: The suite
+    :raises ValueError: If there is no such suite, task or variant, or the file says something else
+    """
+    path = SUITES / f"{name}.yml"
+    path = path if path.is_file() else Path(name)
+    if not path.is_file():
+        raise ValueError(f"suite: {name!r} given; accepted are {', '.join(suite_names())}, or the path of a YAML file")
+    try:
+        suite = msgspec.convert(yaml.safe_load(path.read_text()), Suite)
+    except (yaml.YAMLError, msgspec.ValidationError) as error:
+        raise ValueError(f"suite: {path} is none: {error}") from None
+    _chosen("also", suite.tasks, list(suite.also))
+    suite.tasks = _chosen("tasks", suite.tasks, tasks)
+    suite.variants = _chosen("variants", suite.variants, variants)
+    suite.also = {task: others for task, others in suite.also.items() if task in suite.tasks}
+    suite.seeds = list(suite.seeds if seeds is None else seeds)
+    for kind, of_kind in (("tasks", suite.tasks), ("variants", suite.variants), ("seeds", suite.seeds)):
+        if not of_kind or (kind == "seeds" and len(set(suite.seeds)) < len(suite.seeds)):
+            raise ValueError(f"{kind}: {list(of_kind)} given; accepted are one or more, each once")
+    return suite
+
+
+def _chosen(kind: str, known: dict[str, Any], names: Sequence[str] | None) -> dict[str, Any]:
+    for name in names or ():
+        if name not in known:
+            raise ValueError(f"{kind}: {name!r} given; the suite's are {', '.join(known)}")
+    return known if names is None else {name: known[name] for name in known if name in names}
