@@ -1,6 +1,6 @@
 """Replay buffer that knows modes, and stores target actions beside every action."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -394,12 +394,15 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         new_ways = [trajectory.rows for trajectory in stays if self.way_novelty[trajectory.rows[-1]] > 0]
         self._new_way_rows = np.concatenate([self._new_way_rows[:0], *new_ways])
 
-    def mode_success_rows(self) -> np.ndarray:
+    def places_of(self, modes: Collection[int]) -> th.Tensor:
         """
-        :return: Rows of the goal-reached trajectories that train a mode by its own way, shape [N]
+        :param modes: Indices of modes
+        :return: Where the goal-reached trajectories go that train one of these by its own way, [N, features.dim]
         """
-        training = [each.rows for each in self.trajectories(success=True) if each.trains]
-        return np.concatenate([np.empty(0, dtype=np.int32), *training])
+        rows = [each.rows for each in self.trajectories(success=True) if each.trains and each.mode in modes]
+        if not rows:
+            return th.empty(0, self.features.dim)
+        return self.features.of_tensors(self.read_observations(np.concatenate(rows))[1])
 
     def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:
         """

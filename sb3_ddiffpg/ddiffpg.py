@@ -35,6 +35,8 @@ SelfDDiffPG = TypeVar("SelfDDiffPG", bound="DDiffPG")
 
 # Of the exploratory group's batch, from trajectories that took a new way: among all transitions these are too few to be met
 NEW_WAY_SHARE = 0.25
+# A mode that succeeds this often, when it is commanded, needs no explorers any more
+ABLE = 0.5
 
 
 class DDiffPG(ModeControl, NoveltyActorCritic):
@@ -114,8 +116,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation
     :param episodic_novelty: Whether a place pays only when it is reached for the first time in an episode (Zhang et al., 2021,
         section 3): otherwise explorers stand where fewest have been
-    :param explore_off_modes: Whether explorers are paid nothing for places where the trajectories go that train the modes, so
-        that another way pays where it leaves the known ones, not only where it ends
+    :param explore_off_modes: Whether explorers are paid nothing for places where the trajectories of the modes go that reach
+        the goal in half of their episodes, so that another way pays where it leaves the known ones, not only where it ends
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
     :param max_grad_norm: Largest gradient norm of the policy and of each mode's critics
@@ -386,14 +388,15 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
 
     def recluster(self) -> list[ModeEvent]:
         """
-        See ``ModeControl``. From now on the places where the modes' trajectories go are known.
+        See ``ModeControl``. From now on the places are known where the trajectories of those modes go that know their way.
 
         :return: What happened: births, splits, merges and retirements
         """
         events = super().recluster()
-        if self.explore_off_modes and len(rows := self.replay_buffer.mode_success_rows()):
-            reached = self.replay_buffer.read_observations(rows)[1]
-            self.known_places.replace(self.replay_buffer.features.of_tensors(reached))
+        if self.explore_off_modes:
+            # What a young mode cannot do yet, explorers must go on with
+            able = [index for index, mode in enumerate(self._modes) if mode.success_rate >= ABLE]
+            self.known_places.replace(self.replay_buffer.places_of(able))
         return events
 
     def _row_embeddings(self, batch: ModeBatch, masked: bool) -> th.Tensor:

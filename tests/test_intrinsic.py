@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.intrinsic import RandomNetworkDistillation, RunningMoments, VisitCounts, noveld_reward
+from sb3_ddiffpg.modes import Outcome
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
 
 
@@ -342,9 +343,17 @@ def test_each_episode_draws_its_noise():
     assert (changes >= episodes / 4).all() and changes.sum() <= episodes
 
 
-@pytest.mark.parametrize("explore_off_modes", [True, False])
-def test_where_modes_go_is_not_new_to_explorers(explore_off_modes):
-    """Told from the trajectories themselves: explorers are paid for none of the cells that those of the modes have reached."""
+def make_able(model, able):
+    """Give each mode ten commanded episodes, half of which succeed where it is able, else fewer."""
+    for index, mode in enumerate(model.modes):
+        mode.outcomes.clear()
+        mode.outcomes.extend(Outcome(k < (5 if index in able else 4), 1.0, 5) for k in range(10))
+    model.recluster()
+
+
+@pytest.mark.parametrize(("explore_off_modes", "able"), [(True, [0]), (True, []), (False, [0])])
+def test_where_able_modes_go_is_not_new_to_explorers(explore_off_modes, able):
+    """Told from the trajectories themselves: explorers are paid for no cell that those of able modes reach."""
     kwargs = {
         "novelty_kwargs": {"cell_size": 0.05},
         "episodic_novelty": False,
@@ -352,16 +361,16 @@ def test_where_modes_go_is_not_new_to_explorers(explore_off_modes):
         "normalize_intrinsic": False,
     }
     model = filled_model(explore_off_modes=explore_off_modes, **kwargs)
-    model.recluster()
+    make_able(model, able)
     buffer = model.replay_buffer
     known = set()
     for trajectory in buffer.trajectories(success=True):
-        if trajectory.trains:
+        if trajectory.trains and trajectory.mode in able:
             known |= set(np.floor(buffer.full_path(trajectory)[1:, 0] / 0.05).astype(int).tolist())
     stored = buffer._all.rows[: buffer.size()]
     cells = np.floor(buffer.next_observations[stored, 0] / 0.05).astype(int)
     on_modes = np.isin(cells, list(known))
-    assert 0.1 < on_modes.mean() < 0.95
+    assert 0.1 < on_modes.mean() < 0.95 or not able
     rewards = model._intrinsic_rewards(np.stack([stored, stored])[:, :, None], defaultdict(list))
     np.testing.assert_array_equal(rewards[0].numpy() > 0, ~on_modes if explore_off_modes else np.ones(len(stored), bool))
     assert (rewards[1] > 0).all()  # the modes themselves go on as before
@@ -369,6 +378,7 @@ def test_where_modes_go_is_not_new_to_explorers(explore_off_modes):
 
 def test_known_places_are_saved(tmp_path):
     model = filled_model(explore_off_modes=True)
+    make_able(model, [0])
     assert model.known_places.known.any()
     model.save(tmp_path / "model")
     model.export(tmp_path / "safe")
