@@ -100,18 +100,36 @@ def plot_routes(
     else:
         views, components = [figure.subplots()], [[0, min(1, dim - 1)]]
         _label_axes(views[0])
-        if maze is not None:
-            _draw_maze(views[0], maze)
-    handles = {}
+    for axes, parts in zip(views, components, strict=True):
+        draw_routes(axes, episodes, maze, colors, parts)
+    figure.legend(*views[-1].get_legend_handles_labels(), loc="outside right upper")
+    return figure
+
+
+def draw_routes(
+    axes: Any,
+    episodes: Mapping[str, Sequence[EpisodeResult]],
+    maze: Any = None,
+    colors: Mapping[str, str] | None = None,
+    components: Sequence[int] = (0, 1),
+) -> None:
+    """
+    The routes of some episodes, one colour and label for each name. Failed episodes are dashed.
+
+    :param axes: Where
+    :param episodes: Episodes by name
+    :param maze: An ``envs.Maze`` that is drawn below
+    :param colors: Colours by name
+    :param components: Of the mode features that are drawn
+    """
+    if maze is not None:
+        _draw_maze(axes, maze)
     for number, (name, runs) in enumerate(episodes.items()):
         color = (colors or {}).get(name, mode_color(number))
         for run in runs:
-            for axes, parts in zip(views, components, strict=True):
-                style = "--" if run.success is False else "-"
-                axes.plot(*run.path[:, parts].T, style, color=color, alpha=0.35, lw=1)
-        (handles[name],) = views[-1].plot([], [], color=color, label=name)
-    figure.legend(list(handles.values()), list(handles), loc="outside right upper")
-    return figure
+            style = "--" if run.success is False else "-"
+            axes.plot(*run.path[:, list(components)].T, style, color=color, alpha=0.35, lw=1)
+        axes.plot([], [], color=color, label=name)
 
 
 def plot_dendrogram(model: Any) -> Figure:

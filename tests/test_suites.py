@@ -38,6 +38,21 @@ def tiny(tmp_path):
     return path
 
 
+@pytest.fixture
+def start():
+    """Starts processes that do not outlive the test."""
+    started = []
+
+    def begin(command):
+        started.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT))
+        return started[-1]
+
+    yield begin
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
 def test_settings_go_from_the_general_to_the_particular(tmp_path):
     path = tmp_path / "a.yml"
     path.write_text(
@@ -136,7 +151,7 @@ def _wait_for(condition, seconds=120):
 
 def _processes():
     """Number, parent's number and command line of each."""
-    return subprocess.run(["ps", "-eo", "pid,ppid,args"], capture_output=True, text=True).stdout.split("\n")
+    return subprocess.run(["ps", "-wweo", "pid,ppid,args"], capture_output=True, text=True).stdout.split("\n")
 
 
 def test_a_process_that_dies_is_started_again(tiny, tmp_path):
@@ -175,14 +190,14 @@ def test_what_fails_is_named_and_the_others_go_on(tiny, tmp_path, monkeypatch, c
     assert [place.parts[1] for place in missing_trials(read_suite(str(tiny)), tmp_path)] == ["td3_c51, wide"]
 
 
-def test_ctrl_c_ends_all_with_a_checkpoint(tiny, tmp_path):
+def test_ctrl_c_ends_all_with_a_checkpoint(tiny, tmp_path, start):
     """And the same command goes on."""
     tiny.write_text(TINY.replace("n_timesteps: 1600", "n_timesteps: 100000000"))
     command = [sys.executable, "-m", "sb3_ddiffpg.experiments", "run", str(tiny), "--out", str(tmp_path / "out")]
     # In the background a shell may have told processes to ignore it
     script = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
     script += "from sb3_ddiffpg.experiments.__main__ import main; main(sys.argv[1:])"
-    process = subprocess.Popen([sys.executable, "-c", script, *command[3:]], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    process = start([sys.executable, "-c", script, *command[3:]])
     _wait_for(lambda: len(list((tmp_path / "out").rglob("progress.json"))) == 2)
     process.send_signal(signal.SIGINT)
     assert process.wait(90) != 0
@@ -190,10 +205,10 @@ def test_ctrl_c_ends_all_with_a_checkpoint(tiny, tmp_path):
     assert len(list((tmp_path / "out").rglob("checkpoint_*"))) == 2
 
 
-def test_a_runner_that_is_killed_leaves_no_process(tiny, tmp_path):
+def test_a_runner_that_is_killed_leaves_no_process(tiny, tmp_path, start):
     tiny.write_text(TINY.replace("n_timesteps: 1600", "n_timesteps: 100000000"))
     command = [sys.executable, "-m", "sb3_ddiffpg.experiments", "run", str(tiny), "--out", str(tmp_path / "out")]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = start(command)
     _wait_for(lambda: len(list((tmp_path / "out").rglob("progress.json"))) == 2)
     process.kill()
     process.wait()
@@ -222,14 +237,12 @@ def test_a_local_executor_that_is_stopped_runs_nothing_more(tiny, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_ray_worker_that_is_killed_is_replaced(tmp_path):
+def test_a_ray_worker_that_is_killed_is_replaced(tmp_path, start):
     """On a local Ray with two workers, one of them killed in the middle, with what it runs."""
     path = tmp_path / "tiny.yml"
     path.write_text(TINY.replace("n_timesteps: 1600", "n_timesteps: 12000"))
     command = [sys.executable, "-m", "sb3_ddiffpg.experiments", "run", str(path), "--out", str(tmp_path / "out")]
-    process = subprocess.Popen(
-        [*command, "--ray", "--workers", "2", "--no-report"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-    )
+    process = start([*command, "--ray", "--workers", "2", "--no-report"])
     place = tmp_path / "out" / "PointMazeV1-v0" / "ddiffpg" / "seed0"
     _wait_for(lambda: list(place.rglob("checkpoint_*.safetensors")), 240)
     worker = next(int(line.split()[1]) for line in _processes() if "trial" in line and str(place) in line)
