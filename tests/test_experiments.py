@@ -9,6 +9,7 @@ import time
 import numpy as np
 import pytest
 import yaml
+from filelock import FileLock
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.evaluation import ModeEvaluation
@@ -101,6 +102,7 @@ def test_settings_that_do_not_exist(monkeypatch, tmp_path, capsys):
         ((*point, "--override", "{n_timesteps: .nan}"), "n_timesteps: nan given"),
         ((*point, "--settings", "{gamma: 1}", "--override", "{gamma: 1}"), "one or the other"),
         ((*point, "--members", "0"), "members: 0 given"),
+        (("--again", str(tmp_path), "--seed", "5"), "--again: given beside seed"),
     ):
         with pytest.raises(SystemExit) as ended:
             record(monkeypatch, tmp_path / "run", *arguments)
@@ -154,3 +156,27 @@ def test_a_trial_ends_with_the_process_that_started_it(tmp_path):
     assert process.wait(60) == 1
     assert "the same command goes on" in process.stderr.read()
     assert list((tmp_path / "logs" / "checkpoints").glob("*.safetensors"))
+
+
+def test_settings_are_looked_at_again_under_the_lock(tmp_path):
+    """Two processes want one folder: the one that waited must not take the other's training for its own."""
+    (tmp_path / "logs").mkdir()
+    command = [
+        sys.executable,
+        "-m",
+        "sb3_ddiffpg.experiments",
+        "trial",
+        "--env",
+        "PointMazeV1-v0",
+        "--seed",
+        "1",
+        "--tests",
+        TESTS,
+    ]
+    with FileLock(tmp_path / "logs" / "lock"):
+        process = subprocess.Popen([*command, "--override", SMALL, "--out", str(tmp_path)], stderr=subprocess.PIPE, text=True)
+        time.sleep(15)  # it has looked, and waits
+        assert process.poll() is None
+        record = {"algo": "ddiffpg", "env": "PointMazeV1-v0", "seed": 0, "hyperparams": {}, "result": {"complete": True}}
+        (tmp_path / "config.yml").write_text(yaml.safe_dump(record))
+    assert "holds another training" in process.communicate(timeout=60)[1] and process.returncode == 1

@@ -24,6 +24,7 @@ ENV = "PointMazeV1-v0"
 
 
 def evaluation(n_successes, length=20.0, env_id=ENV):
+    length = length if n_successes else float("nan")
     uncommanded = CommandResult(None, 20, n_successes, length, n_successes / 20, {"0:a": n_successes} if n_successes else {})
     return ModeEvaluation(env_id, "environment", ("0:a", "0:-"), 0.0, uncommanded, (), ())
 
@@ -254,3 +255,54 @@ def test_the_papers_numbers_are_whole():
         24.3,
     ]
     assert paper["AntMazeRandom-v0"]["td3_c51"] == [None, 0.5, 310.2] and paper["AntMazeV2-v0"]["rpg"] == [1.5, 0.5, 259.4]
+
+
+def test_only_seeds_of_the_same_are_averaged(tmp_path):
+    """Not a training with other settings, and not one seed twice."""
+    training(tmp_path, "a", 0, 5)
+    other = training(tmp_path, "a", 1, 5, gamma=0.5)
+    with pytest.raises(ValueError, match="differ in their settings"):
+        make_report(tmp_path, tmp_path / "out", "x")
+    shutil.rmtree(other)
+    shutil.copytree(tmp_path / ENV / "a" / "seed0", tmp_path / "copy")
+    with pytest.raises(ValueError, match="have the same seed"):
+        make_report(tmp_path, tmp_path / "out", "x")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", "\0\xff", "algo: ddiffpg", "result: null"])
+def test_a_damaged_record_is_no_training_and_hides_none(tmp_path, text):
+    """What lies below it is not taken for others."""
+    training(tmp_path, "a", 0, 5)
+    damaged = training(tmp_path, "union", 0, 5)
+    shutil.copytree(damaged, damaged / "member_0")
+    (damaged / "config.yml").write_bytes(text.encode("latin-1"))
+    runs, others = store.read_results(tmp_path)
+    assert [run.trial.variant for run in runs] == ["a"] and others == [damaged]
+    for command in (
+        ["report", str(damaged)],
+        ["card", str(damaged), "--repo-id", "a/b"],
+        ["trial", "--again", str(damaged), "--out", "x"],
+    ):
+        with pytest.raises(SystemExit) as ended:
+            cli.main(command)
+        assert ended.value.code == 2
+
+
+@pytest.mark.parametrize("name", ["curve.csv", "evaluation.json"])
+def test_a_damaged_file_is_named(tmp_path, name, capsys):
+    (training(tmp_path, "a", 0, 5) / name).write_text("")
+    with pytest.raises(SystemExit):
+        cli.main(["report", str(tmp_path)])
+    assert "seed0" in capsys.readouterr().err
+
+
+def test_what_is_not_known_is_not_counted(tmp_path):
+    """No success has no length; SB3's own algorithms have no parts that could be timed."""
+    for seed, n in enumerate((0, 0, 20)):
+        training(tmp_path, "td3", seed, n, algo="td3")
+    runs = store.read_results(tmp_path)[0]
+    table = summary.task_table(runs)
+    assert table.loc[0, "length"] == "20.0 (of 1)" and table.loc[0, "seeds"] == "3"
+    for run in runs:
+        run.record["result"]["seconds"] = dict.fromkeys(run.record["result"]["seconds"], 0.0)
+    assert summary.seconds_per_update(runs[0]) is None and not figures.wall_clock(runs).axes[0].patches

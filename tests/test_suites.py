@@ -29,6 +29,8 @@ seeds: [0]
 settings: {n_timesteps: 1600, n_envs: 4}
 tests: {n_tests: 2, n_test_episodes: 2, n_episodes: 3}
 """
+# Under which nothing else is refused
+ALSO = "\nalso: {PointMazeV1-v0: [PointMazeV2-v0]}"
 
 
 @pytest.fixture
@@ -103,10 +105,22 @@ def test_every_suite_of_the_package_can_be_run(name):
         (("n_tests: 2", "n_tests: 0"), "n_tests"),
         (("seeds: [0]", "also: {AntMazeV1-v0: []}\nseeds: [0]"), "AntMazeV1-v0"),
         (("variants:", "variants: ["), "is none"),
+        (("td3_c51, wide", "../wide"), "variant"),
+        (("td3_c51, wide", "a/b"), "variant"),
+        (("td3_c51, wide", "a|b"), "variant"),
+        (("td3_c51, wide", "-x"), "variant"),
+        (("td3_c51, wide", ""), "variant"),
+        (("seeds: [0]", "seeds: [-1]"), "seed"),
+        (("seeds: [0]", "seeds: [4294967296]"), "seed"),
+        (("seeds: [0]", "seeds: [0]\nresources: {cpus: 0}"), "resources"),
+        (("seeds: [0]", "seeds: [0]\nablation: nonsense"), "ablation"),
+        (("seeds: [0]", "seeds: [0]\nconf_file: tiny.yml"), "conf-file"),
+        (("{algo: td3_c51}", "{algo: td3_c51, members: 2000}"), "members"),
+        (("{n_timesteps: 1600", "{normalize: true, n_timesteps: 1600"), "normalize"),
     ],
 )
 def test_a_suite_that_cannot_be_is_refused_before_anything_runs(tiny, tmp_path, capsys, change, said):
-    tiny.write_text(TINY.replace(*change))
+    tiny.write_text(TINY.replace(*change) + (ALSO if said == "normalize" else ""))
     with pytest.raises(SystemExit) as ended:
         cli.main(["run", str(tiny), "--out", str(tmp_path / "out")])
     assert ended.value.code == 2 and said in capsys.readouterr().err

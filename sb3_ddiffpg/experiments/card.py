@@ -14,6 +14,7 @@ from sb3_ddiffpg.zoo import ALGOS, register
 
 try:
     from huggingface_hub import EvalResult, HfApi, ModelCard, ModelCardData
+    from huggingface_hub.utils import validate_repo_id
 except ImportError as error:
     raise ImportError(
         f"the Hugging Face hub is an extra ({error}); install it with: pip install 'sb3_ddiffpg[hub]'"
@@ -39,7 +40,7 @@ def write_card(folder: Path, repo_id: str) -> Path:
         model_name=f"{run.trial.algo} in {run.trial.env}",
         library_name="stable-baselines3",
         license="mit",
-        tags=["reinforcement-learning", "deep-reinforcement-learning", "stable-baselines3", "diffusion-policy", run.trial.env],
+        tags=["reinforcement-learning", "deep-reinforcement-learning", "stable-baselines3", run.trial.algo, run.trial.env],
         eval_results=[
             EvalResult(
                 task_type="reinforcement-learning",
@@ -60,6 +61,8 @@ def write_card(folder: Path, repo_id: str) -> Path:
         template_path=str(TEMPLATE),
         algo=run.trial.algo,
         class_name=type(model).__name__,
+        package=_package(model),
+        normalized=(folder / "vecnormalize.pkl").is_file(),
         env=run.trial.env,
         repo_id=repo_id,
         evaluation=str(found),
@@ -88,6 +91,12 @@ def upload(folder: Path, repo_id: str, api: Any = None) -> str:
     return str(done)
 
 
+def _package(model: Any) -> str:
+    """From where its class is imported."""
+    module = type(model).__module__
+    return module.split(".")[0] if not module.startswith("sb3_ddiffpg.baselines") else "sb3_ddiffpg.baselines"
+
+
 def _read(folder: Path) -> Recorded:
     run = read_training(folder)
     if not (folder / "model.zip").is_file():
@@ -111,7 +120,11 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
     """
     register()
     _read(given.folder)
-    if given.repo_id.count("/") != 1:
+    try:
+        validate_repo_id(given.repo_id)
+    except ValueError as error:
+        raise ValueError(f"--repo-id: {error}") from None
+    if "/" not in given.repo_id:
         raise ValueError(f"--repo-id: {given.repo_id!r} given; accepted is OWNER/NAME")
     return partial(_work, given)
 

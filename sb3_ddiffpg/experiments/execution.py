@@ -8,11 +8,8 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, Protocol
 
-import msgspec
-import yaml
-
 from sb3_ddiffpg.experiments.suite import Resources
-from sb3_ddiffpg.experiments.trial import Trial
+from sb3_ddiffpg.experiments.trial import Trial, command_line
 
 # Every library that would otherwise take all cores
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -41,14 +38,9 @@ def command_of(trial: Trial, folder: Path) -> list[str]:
     """
     :param trial: What to run
     :param folder: Where its record goes
-    :return: The command line that does it
+    :return: The command that does it, and ends with the process that started it
     """
-    command = [sys.executable, "-m", "sb3_ddiffpg.experiments", "trial", "--algo", trial.algo, "--env", trial.env]
-    command += ["--variant", trial.variant, "--seed", str(trial.seed), "--members", str(trial.members)]
-    # All settings, so that it does not matter which files the other machine has
-    settings = yaml.safe_dump(trial.hyperparams, default_flow_style=True, width=10**6).strip()
-    tests = yaml.safe_dump(msgspec.to_builtins(trial.tests), default_flow_style=True, width=10**6).strip()
-    return [*command, "--settings", settings, "--tests", tests, "--out", str(folder), "--attached"]
+    return [sys.executable, "-m", "sb3_ddiffpg.experiments", *command_line(trial, folder), "--attached"]
 
 
 def run_process(command: list[str], folder: Path, threads: int, running: "set[subprocess.Popen[bytes]] | None" = None) -> None:
@@ -142,9 +134,23 @@ class RayExecutor:
         self._ray, self.retries = ray, retries
         arguments: dict[str, Any] = {"address": address, "log_to_driver": False, "configure_logging": False}
         if address == "local":
+            # Its workers would otherwise wait until nothing else wants a core
+            os.environ.setdefault("RAY_worker_niceness", "0")
             arguments |= {"num_cpus": workers, "include_dashboard": False}
         self._context = ray.init(**arguments)
         self._tasks: list[Any] = []
+
+    def check(self, resources: Resources) -> None:
+        """
+        :param resources: What a trial takes
+        :raises ValueError: If no machine of the cluster has as much: Ray would wait for one that does
+        """
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        if not any(node.get("CPU", 0) >= resources.cpus and node.get("GPU", 0) >= resources.gpus for node in nodes):
+            has = ", ".join(f"{node.get('CPU', 0):g} cpus and {node.get('GPU', 0):g} gpus" for node in nodes)
+            raise ValueError(
+                f"resources: {resources.cpus} cpus and {resources.gpus:g} gpus for a trial; the machines have {has}"
+            )
 
     def submit(self, trial: Trial, folder: Path, resources: Resources) -> "Future[None]":
         """See ``Executor``."""

@@ -10,9 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from sb3_ddiffpg import plots
+from sb3_ddiffpg.actor_critic import NoveltyActorCritic
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.experiments.store import Recorded, by, task_of, variant_of
-from sb3_ddiffpg.experiments.summary import MEASURES, over_tasks
+from sb3_ddiffpg.experiments.summary import MEASURES, over_tasks, seconds_per_update
 from sb3_ddiffpg.experiments.wall_clock import PARTS
 from sb3_ddiffpg.zoo import ALGOS
 
@@ -117,7 +118,7 @@ def wall_clock(runs: Sequence[Recorded]) -> Figure:
     :param runs: Trainings
     :return: The figure
     """
-    timed = [run for run in runs if run.result.get("seconds") and run.result.get("updates")]
+    timed = [run for run in runs if seconds_per_update(run) is not None]
     rows = {
         variant: pd.DataFrame([run.result["seconds"] for run in own]).sum() / sum(run.result["updates"] for run in own) * 1000
         for variant, own in by(variant_of, timed).items()
@@ -141,7 +142,11 @@ class Maps:
 
     def __init__(self, runs: Sequence[Recorded]) -> None:
         firsts = {variant: own[0] for variant, own in by(variant_of, runs).items()}
-        shown = {variant: run for variant, run in firsts.items() if (run.folder / "model.zip").is_file()}
+        shown = {
+            variant: run
+            for variant, run in firsts.items()
+            if (run.folder / "model.zip").is_file() and issubclass(ALGOS[run.trial.algo], NoveltyActorCritic)
+        }
         self.colors = palette(runs)
         self.models: dict[str, Any] = {
             variant: ALGOS[run.trial.algo].load(_final_model(run)) for variant, run in shown.items()

@@ -3,6 +3,7 @@
 import argparse
 import base64
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from sb3_ddiffpg.experiments import figures
-from sb3_ddiffpg.experiments.store import Recorded, by, read_results, task_of, variant_of
+from sb3_ddiffpg.experiments.store import Recorded, by, check_alike, read_results, task_of, variant_of
 from sb3_ddiffpg.experiments.summary import elsewhere_table, task_table
 from sb3_ddiffpg.zoo import register
 
@@ -33,6 +34,10 @@ def make_report(results: Path, output: Path, title: str, ablation: str | None = 
     runs, incomplete = read_results(results)
     if not runs:
         raise ValueError(f"results: none of the {len(incomplete)} trainings in {results} is complete")
+    check_alike(runs)
+    values = [run.trial.hyperparams.get(ablation) for run in runs] if ablation is not None else []
+    if not all(isinstance(value, (int, float)) for value in values):
+        raise ValueError(f"ablation: {ablation!r} given; accepted is a setting that is a number in every training")
     output.mkdir(parents=True, exist_ok=True)
     drawn = _Drawn(output)
     _draw(drawn, runs, ablation)
@@ -95,7 +100,8 @@ def _draw(drawn: _Drawn, runs: Sequence[Recorded], setting: str | None) -> None:
             "success_rate_hours", "Success without command against hours.", figures.curves(runs, "success_rate", "hours")
         )
     if len(by(task_of, runs)) > 1:
-        drawn.add("aggregate", "Over all tasks and seeds, stratified bootstrap.", figures.aggregate(runs))
+        scope = "variants that have every task, over tasks and seeds (as many of each task as the one with fewest has)"
+        drawn.add("aggregate", f"Interquartile means of the {scope}, stratified bootstrap.", figures.aggregate(runs))
     if setting is not None:
         drawn.add("ablation", f"The final models over {setting}.", figures.ablation(runs, setting))
     if any(run.result.get("seconds") for run in runs):
@@ -123,10 +129,8 @@ def _machines(runs: Sequence[Recorded]) -> list[str]:
 
 def _commands(runs: Sequence[Recorded]) -> dict[str, str]:
     """How the first training of each variant can be done again."""
-    firsts = {variant: own[0] for variant, own in by(variant_of, runs).items()}
-    return {
-        variant: f"python -m sb3_ddiffpg.experiments trial --again {run.folder} --out DIR" for variant, run in firsts.items()
-    }
+    again = "python -m sb3_ddiffpg.experiments trial --again"
+    return {variant: f"{again} {shlex.quote(str(own[0].folder))} --out DIR" for variant, own in by(variant_of, runs).items()}
 
 
 def _encoded(path: Path) -> str:
@@ -150,10 +154,7 @@ def prepare(given: argparse.Namespace) -> Callable[[], Any]:
     :raises ValueError: If it asks for what there is not
     """
     register()
-    read_results(given.results)
-    return partial(_report, given)
-
-
-def _report(given: argparse.Namespace) -> None:
     output = given.out or given.results / "report"
-    print(f"wrote {make_report(given.results, output, given.title or given.results.resolve().name, given.ablation)}")
+    title = given.title or given.results.resolve().name
+    # Nothing in it runs for long: what is wrong with the results is said as what is wrong with the arguments
+    return partial(print, f"wrote {make_report(given.results, output, title, given.ablation)}")

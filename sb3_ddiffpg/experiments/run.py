@@ -179,6 +179,11 @@ def _run(given: argparse.Namespace, suite: Suite, folder: Path, missing: bool) -
             executor = LocalExecutor(given.workers or max(1, cores // suite.resources.cpus), given.retries)
         else:
             executor = RayExecutor(given.ray, given.retries, given.workers and given.workers * suite.resources.cpus)
+            try:
+                executor.check(suite.resources)
+            except ValueError as error:
+                executor.stop()
+                raise SystemExit(str(error)) from None
         failed = run_suite(name, suite, folder, executor)
         if failed:
             raise SystemExit(f"{len(failed)} trials failed: {', '.join(map(str, failed))}. The same command tries them again")

@@ -8,6 +8,7 @@ from typing import Any
 
 import pandas as pd
 import yaml
+from msgspec.structs import replace
 
 from sb3_ddiffpg.evaluation import ModeEvaluation
 from sb3_ddiffpg.experiments.trial import Trial, recorded_trial
@@ -48,10 +49,11 @@ def read_results(folder: Path) -> tuple[list[Recorded], list[Path]]:
     complete, others = [], []
     for place, folders, files in os.walk(folder):
         folders.sort()
-        if "config.yml" not in files or (record := _record(Path(place))) is None:
+        if "config.yml" not in files:
             continue
         folders.clear()  # what lies below are members of a union, and logs
-        recorded = _read(Path(place), record)
+        record = _record(Path(place))
+        recorded = None if record is None else _read(Path(place), record)
         if recorded is None:
             others.append(Path(place))
         else:
@@ -75,19 +77,26 @@ def read_training(folder: Path) -> Recorded:
 
 
 def _record(folder: Path) -> dict[str, Any] | None:
-    """None if the file is somebody else's: the zoo's have the same name."""
+    """None if the file is damaged, or somebody else's: the zoo's have the same name."""
     try:
         record = yaml.safe_load((folder / "config.yml").read_text())
-    except yaml.YAMLError:
+    except (yaml.YAMLError, UnicodeDecodeError):
         return None
     return record if isinstance(record, dict) and {"algo", "env", "seed", "hyperparams"} <= set(record) else None
 
 
 def _read(folder: Path, record: dict[str, Any]) -> Recorded | None:
-    if not record.get("result", {}).get("complete") or not (folder / "evaluation.json").is_file():
+    if not (record.get("result") or {}).get("complete") or not (folder / "evaluation.json").is_file():
         return None
     curve = folder / "curve.csv"
     elsewhere = sorted(folder.glob("evaluation_*.json"))
+    try:
+        return _of_files(folder, record, curve, elsewhere)
+    except (ValueError, pd.errors.ParserError) as error:  # of an evaluation, or an empty table
+        raise ValueError(f"{folder}: {error}") from None
+
+
+def _of_files(folder: Path, record: dict[str, Any], curve: Path, elsewhere: list[Path]) -> Recorded:
     return Recorded(
         folder,
         recorded_trial(folder),
@@ -96,6 +105,23 @@ def _read(folder: Path, record: dict[str, Any]) -> Recorded | None:
         ModeEvaluation.load(folder / "evaluation.json"),
         {path.stem.removeprefix("evaluation_"): ModeEvaluation.load(path) for path in elsewhere},
     )
+
+
+def check_alike(runs: Sequence[Recorded]) -> None:
+    """
+    :param runs: Trainings
+    :raises ValueError: If two of one task and variant are not two seeds of the same
+    """
+    for task in by(task_of, runs).values():
+        for own in by(variant_of, task).values():
+            seeds: dict[int, Recorded] = {}
+            for run in own:
+                same = replace(run.trial, seed=own[0].trial.seed) == own[0].trial
+                if not same or run.trial.seed in seeds:
+                    other = seeds.get(run.trial.seed, own[0])
+                    why = "have the same seed" if same else "differ in their settings"
+                    raise ValueError(f"results: {other.folder} and {run.folder} {why}, and cannot be averaged")
+                seeds[run.trial.seed] = run
 
 
 def by(key: Callable[[Recorded], str], runs: Sequence[Recorded]) -> dict[str, list[Recorded]]:

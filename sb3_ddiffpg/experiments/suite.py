@@ -79,9 +79,11 @@ class Suite(msgspec.Struct, forbid_unknown_fields=True):
             for task in self.tasks:
                 for name in self.variants:
                     trial = self._trial(task, name, seed)
-                    if seed == self.seeds[0]:
-                        trial.check()
-                    found[Path(task, name.replace("/", "-"), f"seed{seed}")] = trial
+                    trial.check()
+                    found[Path(task.replace("/", "-"), name, f"seed{seed}")] = trial
+        values = [trial.hyperparams.get(self.ablation) for trial in found.values()] if self.ablation is not None else []
+        if not all(isinstance(value, (int, float)) for value in values):
+            raise ValueError(f"ablation: {self.ablation!r} given; accepted is a setting that is a number in every variant")
         return found
 
     def _trial(self, task: str, name: str, seed: int) -> Trial:
@@ -132,6 +134,8 @@ def read_suite(
     suite.variants = _chosen("variants", suite.variants, variants)
     suite.also = {task: others for task, others in suite.also.items() if task in suite.tasks}
     suite.seeds = list(suite.seeds if seeds is None else seeds)
+    if suite.resources.cpus < 1 or suite.resources.gpus < 0:
+        raise ValueError(f"resources: {suite.resources} given; accepted are cpus from 1 and gpus from 0 up")
     for kind, of_kind in (("tasks", suite.tasks), ("variants", suite.variants), ("seeds", suite.seeds)):
         if not of_kind or (kind == "seeds" and len(set(suite.seeds)) < len(suite.seeds)):
             raise ValueError(f"{kind}: {list(of_kind)} given; accepted are one or more, each once")

@@ -58,10 +58,11 @@ def _cell(values: Sequence[float], digits: int) -> str:
     known = [value for value in values if not np.isnan(value)]
     if not known:
         return "-"
+    fewer = f" (of {len(known)})" if len(known) < len(values) else ""
     if len(known) == 1:
-        return f"{known[0]:.{digits}f}"
+        return f"{known[0]:.{digits}f}{fewer}"
     mean, low, high = interquartile_mean(known)
-    return f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    return f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]{fewer}"
 
 
 def task_table(runs: Sequence[Recorded]) -> pd.DataFrame:
@@ -76,7 +77,7 @@ def task_table(runs: Sequence[Recorded]) -> pd.DataFrame:
         row["hours"] = _cell([run.result["hours"] for run in own], 2)
         row["steps"] = f"{np.mean([run.result['steps'] for run in own]):.3g}"
         row["s per 1000 updates"] = _cell([1000 * time for run in own if (time := seconds_per_update(run)) is not None], 1)
-        rows.append(row | _paper_cells(task_of(own[0]), own[0].trial.algo, variant))
+        rows.append(row | _paper_cells(task_of(own[0]), own[0]))
     return pd.DataFrame(rows).dropna(axis=1, how="all").fillna("-")
 
 
@@ -91,7 +92,7 @@ def elsewhere_table(runs: Sequence[Recorded]) -> pd.DataFrame:
             found = [run.elsewhere[env_id] for run in own]
             row: dict[str, str | None] = {"": variant, "trained in": task, "tested in": env_id, "seeds": str(len(own))}
             row |= {name: _cell([MEASURES[name](each) for each in found], _digits(name)) for name in ("success", "length")}
-            rows.append(row | _paper_cells(env_id, own[0].trial.algo, variant))
+            rows.append(row | _paper_cells(env_id, own[0]))
     return pd.DataFrame(rows).dropna(axis=1, how="all").fillna("-")
 
 
@@ -99,9 +100,10 @@ def _digits(measure: str) -> int:
     return {"success": 2, "coverage": 2}.get(measure, 1)
 
 
-def _paper_cells(task: str, algo: str, variant: str) -> dict[str, str | None]:
+def _paper_cells(task: str, run: Recorded) -> dict[str, str | None]:
     """The paper's own, for the algorithm itself, not for what was changed of it."""
-    numbers = paper_results().get(task, {}).get(algo) if variant == algo else None
+    itself = run.trial.variant == run.trial.algo and run.trial.members == 1
+    numbers = paper_results().get(task, {}).get(run.trial.algo) if itself else None
     names = "paper: modes", "paper: success", "paper: length"
     if numbers is None:
         return dict.fromkeys(names)
@@ -114,8 +116,8 @@ def seconds_per_update(run: Recorded) -> float | None:
     :return: Seconds of learning for each update; None if it was not measured
     """
     seconds, updates = run.result.get("seconds"), run.result.get("updates")
-    if not seconds or not updates:
-        return None
+    if not seconds or not updates or not any(seconds[part] for part in PARTS):
+        return None  # SB3's own algorithms have no such parts
     return sum(seconds[part] for part in PARTS if part != "collection") / updates
 
 

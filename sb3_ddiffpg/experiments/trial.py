@@ -6,6 +6,8 @@ One training that leaves all that is needed to judge it and to do it again, in o
 import argparse
 import importlib
 import math
+import os
+import re
 import shlex
 import shutil
 import signal
@@ -13,7 +15,7 @@ import sys
 import threading
 from collections.abc import Callable
 from datetime import UTC, datetime
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ import gymnasium as gym
 import msgspec
 import yaml
 from filelock import FileLock, Timeout
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalization
 
 from sb3_ddiffpg.actor_critic import NoveltyActorCritic
 from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
@@ -93,11 +95,24 @@ class Trial(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
             check_hyperparameters(self.algo, list(self.hyperparams))
         except TypeError as error:
             raise ValueError(f"settings of {self.variant} in {self.env}: {error}") from None
+        if re.fullmatch(r"\w[\w .,+=()-]{0,60}", self.variant) is None:
+            accepted = "1 to 61 letters, digits, blanks and .,+=()-_ that begin with a letter or digit"
+            raise ValueError(f"variant: {self.variant!r} given; accepted are {accepted}")
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"seed: {self.seed} given; accepted are whole numbers from 0 to {2**31 - 1}")
+        if self.tests.also and self.members > 1:
+            raise ValueError(f"also: {self.tests.also} given beside members: {self.members}; accepted is one of both")
+        if self.hyperparams.get("normalize") and (self.tests.also or self.members > 1):
+            raise ValueError("normalize: given beside also or members, whose environments are not normalised")
         counts = {"members": self.members, "n_timesteps": self.hyperparams.get("n_timesteps", 1)}
         counts |= {name: getattr(self.tests, name) for name in ("n_tests", "n_test_episodes", "n_episodes")}
         for name, value in counts.items():
             if not isinstance(value, (int, float)) or not 1 <= value < math.inf:
                 raise ValueError(f"{name}: {value!r} given; accepted are numbers from 1 up")
+        if counts["n_timesteps"] < self.members and "n_timesteps" in self.hyperparams:
+            raise ValueError(
+                f"members: {self.members} given for {counts['n_timesteps']:g} steps; accepted is one step for each"
+            )
 
 
 def hyperparameters(algo: str, env_id: str, conf_file: str | None, overrides: dict[str, Any]) -> dict[str, Any]:
@@ -112,10 +127,20 @@ def hyperparameters(algo: str, env_id: str, conf_file: str | None, overrides: di
     path = config_file(conf_file or algo) or Path(conf_file or algo)
     if not path.is_file():
         raise ValueError(f"conf-file: {conf_file!r} given for {algo!r}; accepted is a YAML file, or the name of one of ours")
-    entries = yaml.safe_load(path.read_text())
-    if env_id not in entries:
-        raise ValueError(f"env: {env_id!r} given; {path.name} has settings for {', '.join(sorted(entries))}")
+    entries = _entries(path, path.stat().st_mtime_ns)
+    if not isinstance(entries, dict) or not isinstance(entries.get(env_id), dict):
+        known = ", ".join(sorted(map(str, entries))) if isinstance(entries, dict) else "nothing"
+        raise ValueError(f"env: {env_id!r} given; {path.name} has settings for {known}")
     return {name: _number(value) for name, value in {**entries[env_id], **overrides}.items()}
+
+
+@cache
+def _entries(path: Path, changed_at: int) -> Any:
+    """A suite reads the same file for every trial."""
+    try:
+        return yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"conf-file: {path} is no YAML: {error}") from None
 
 
 def recorded_trial(folder: Path) -> Trial:
@@ -127,9 +152,12 @@ def recorded_trial(folder: Path) -> Trial:
     path = folder / "config.yml"
     if not path.is_file():
         raise ValueError(f"{folder} given; accepted is the folder of a recorded training, with a config.yml")
-    recorded = yaml.safe_load(path.read_text())
-    known = {name: recorded[name] for name in Trial.__struct_fields__ if name in recorded}
-    return msgspec.convert({"variant": recorded["algo"], **known}, Trial)
+    try:
+        recorded = yaml.safe_load(path.read_text())
+        known = {name: recorded[name] for name in Trial.__struct_fields__ if name in recorded}
+        return msgspec.convert({"variant": recorded["algo"], **known}, Trial)
+    except (yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError, msgspec.ValidationError) as error:
+        raise ValueError(f"{path} is not the record of a training: {error}") from None
 
 
 def run_trial(trial: Trial, folder: Path) -> None:
@@ -146,6 +174,7 @@ def run_trial(trial: Trial, folder: Path) -> None:
     (folder / "logs").mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(folder / "logs" / "lock", timeout=SECONDS_TO_WAIT):
+            check_folder(trial, folder)  # somebody else's may have come first
             if is_complete(folder):
                 print(f"{folder} is complete")
             elif trial.members > 1:
@@ -172,7 +201,8 @@ def is_complete(folder: Path) -> bool:
     :return: Whether there is nothing left to do
     """
     path = folder / "config.yml"
-    return path.is_file() and bool((yaml.safe_load(path.read_text()) or {}).get("result", {}).get("complete"))
+    recorded = yaml.safe_load(path.read_text()) if path.is_file() else None
+    return isinstance(recorded, dict) and bool((recorded.get("result") or {}).get("complete"))
 
 
 class _Training:
@@ -185,7 +215,7 @@ class _Training:
 
     def __init__(self, trial: Trial, folder: Path) -> None:
         self.trial, self.folder, self.logs = trial, folder, folder / "logs"
-        self.record = _new_record(trial)
+        self.record = _new_record(trial, folder)
 
     def run(self) -> None:
         """Train and evaluate, or go on with that."""
@@ -241,6 +271,10 @@ class _Training:
             test_env.close()
             raise SystemExit(f"Stopped after {model.num_timesteps} of {manager.n_timesteps} steps; the same command goes on")
         write_progress(self.logs, Progress(model.num_timesteps, manager.n_timesteps, "evaluation"))
+        if isinstance(test_env, VecNormalize):
+            trained_in = model.get_env()
+            assert trained_in is not None
+            sync_envs_normalization(trained_in, test_env)  # a resumed training may not have tested since
         model.save(self.logs / "final_model.zip")
         if curve.best_step is None:
             shutil.copy(self.logs / "final_model.zip", self.folder / "model.zip")
@@ -257,15 +291,17 @@ class _Training:
             statistics, env = path.with_name("vecnormalize.pkl"), test_env
             if isinstance(test_env, VecNormalize) and statistics.exists():  # beside the best model only
                 env = VecNormalize.load(str(statistics), test_env.venv)
-            tested = ALGOS[self.trial.algo].load(path)
+            tested: Any = ALGOS[self.trial.algo].load(path)
             found = evaluate_modes(tested, env, n_episodes, seed=seed)
             found.save(self.folder / ("evaluation.json" if name == "best" else "logs/evaluation_final.json"))
             if name == "best" and isinstance(tested, NoveltyActorCritic):
-                tested.save(path, optimizers=False)
+                smaller = self.logs / "model_without_optimizers.zip"
+                tested.save(smaller, optimizers=False)
+                os.replace(smaller, path)  # there is no other copy
             print(f"\n{name} model\n{found}")
         for env_id in self.trial.tests.also:
             found = self._evaluate_elsewhere(tested, env_id, seed, env_kwargs)
-            found.save(self.folder / f"evaluation_{env_id}.json")
+            found.save(self.folder / f"evaluation_{env_id.replace('/', '-')}.json")
             print(f"\nin {env_id}\n{found}")
 
     def _evaluate_elsewhere(self, model: Any, env_id: str, seed: int, env_kwargs: dict[str, Any]) -> ModeEvaluation:
@@ -280,13 +316,13 @@ class _Training:
     def _write_record(self, result: dict[str, Any] | None = None) -> None:
         if result is not None:
             self.record["result"] = result
-        (self.folder / "config.yml").write_text(yaml.safe_dump(self.record, sort_keys=False))
+        _write(self.record, self.folder)
 
 
 def _run_union(trial: Trial, folder: Path) -> None:
     """Its members one after the other, and their evaluation as one model. They share the steps of one training."""
-    record = _new_record(trial)
-    (folder / "config.yml").write_text(yaml.safe_dump(record, sort_keys=False))
+    record = _new_record(trial, folder)
+    _write(record, folder)
     steps = int(trial.hyperparams["n_timesteps"] // trial.members)
     results, models = [], []
     for number in range(trial.members):
@@ -311,21 +347,39 @@ def _run_union(trial: Trial, folder: Path) -> None:
         "complete": True,
         **{name: sum(result[name] for result in results) for name in ("steps", "updates", "hours", "cpu_hours")},
     }
-    (folder / "config.yml").write_text(yaml.safe_dump(record, sort_keys=False))
+    _write(record, folder)
     write_progress(folder / "logs", Progress(record["result"]["steps"], record["result"]["steps"], "done"))
 
 
-def _new_record(trial: Trial) -> dict[str, Any]:
+def command_line(trial: Trial, folder: Path) -> list[str]:
+    """
+    :param trial: What
+    :param folder: Where its record goes
+    :return: Arguments of ``python -m sb3_ddiffpg.experiments`` that do it, whatever files there are
+    """
+    words = ["trial", "--algo", trial.algo, "--env", trial.env, "--variant", trial.variant, "--seed", str(trial.seed)]
+    words += ["--members", str(trial.members)] if trial.members > 1 else []
+    for option, value in (("--settings", trial.hyperparams), ("--tests", msgspec.to_builtins(trial.tests))):
+        words += [option, yaml.safe_dump(value, default_flow_style=True, width=10**6).strip()]
+    return [*words, "--out", str(folder)]
+
+
+def _new_record(trial: Trial, folder: Path) -> dict[str, Any]:
     return {
         **msgspec.to_builtins(trial),
-        "command": shlex.join(
-            ["python", "-m", "sb3_ddiffpg.experiments", *(word for word in sys.argv[1:] if word != "--attached")]
-        ),
+        "command": shlex.join(["python", "-m", "sb3_ddiffpg.experiments", *command_line(trial, folder)]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "git_commit": git_commit(),
         "machine": machine(),
         "versions": versions(),
     }
+
+
+def _write(record: dict[str, Any], folder: Path) -> None:
+    """Whole, or the one before."""
+    unfinished = folder / "logs" / "config.yml"
+    unfinished.write_text(yaml.safe_dump(record, sort_keys=False))
+    os.replace(unfinished, folder / "config.yml")
 
 
 def _end_with_parent() -> None:
@@ -343,17 +397,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
     :param parser: Of the command line
     """
-    parser.add_argument("--algo", default=ALGO)
+    parser.add_argument("--algo", help=f"{ALGO} if not given")
     parser.add_argument("--env")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, help="0 if not given")
     parser.add_argument("--variant", help="name under which the result is reported; the algorithm's if not given")
     parser.add_argument(
         "--conf-file", help="a YAML file as the zoo's, or the name of one of ours; the algorithm's own if not given"
     )
-    parser.add_argument("--override", type=_settings, default={}, help="settings as YAML, such as '{n_timesteps: 1e5}'")
+    parser.add_argument("--override", type=_settings, help="settings as YAML, such as '{n_timesteps: 1e5}'")
     parser.add_argument("--settings", type=_settings, help="all settings as YAML, in place of a file's")
-    parser.add_argument("--members", type=int, default=1, help="trainings that share the steps and are evaluated as one")
-    parser.add_argument("--tests", type=_settings, default={}, help="as YAML: n_tests, n_test_episodes, n_episodes, also")
+    parser.add_argument("--members", type=int, help="trainings that share the steps and are evaluated as one")
+    parser.add_argument("--tests", type=_settings, help="as YAML: n_tests, n_test_episodes, n_episodes, also")
     parser.add_argument("--again", type=Path, help="folder of a recorded training, to do the same again")
     parser.add_argument("--out", type=Path, required=True, help="folder for the record")
     parser.add_argument("--attached", action="store_true", help="end when standard input closes")
@@ -368,6 +422,9 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
     register()
     if (given.env is None) == (given.again is None):
         raise ValueError("--env or --again is needed, and not both")
+    others = ("algo", "seed", "variant", "conf_file", "override", "settings", "members", "tests")
+    if given.again is not None and (beside := [name for name in others if getattr(given, name) is not None]):
+        raise ValueError(f"--again: given beside {', '.join(beside)}; a recorded training is done again as it was")
     trial = recorded_trial(given.again) if given.again is not None else _asked_for(given)
     trial.check()
     check_folder(trial, given.out)
@@ -377,25 +434,26 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
 
 
 def _asked_for(given: argparse.Namespace) -> Trial:
-    if given.algo not in ALGOS:
-        raise ValueError(f"--algo: {given.algo!r} given; accepted are {', '.join(sorted(ALGOS))}")
+    algo = given.algo or ALGO
+    if algo not in ALGOS:
+        raise ValueError(f"--algo: {algo!r} given; accepted are {', '.join(sorted(ALGOS))}")
     if given.settings is None:
-        settings = hyperparameters(given.algo, given.env, given.conf_file, given.override)
+        settings = hyperparameters(algo, given.env, given.conf_file, given.override or {})
     elif given.conf_file is None and not given.override:
         settings = given.settings
     else:
         raise ValueError("--settings: given beside --conf-file or --override; accepted is one or the other")
     try:
-        tests = msgspec.convert(given.tests, Tests)
+        tests = msgspec.convert(given.tests or {}, Tests)
     except msgspec.ValidationError as error:
         raise ValueError(f"--tests: {error}") from None
     return Trial(
         env=given.env,
-        algo=given.algo,
-        variant=given.variant or given.algo,
-        seed=given.seed,
+        algo=algo,
+        variant=algo if given.variant is None else given.variant,
+        seed=given.seed or 0,
         hyperparams=settings,
-        members=given.members,
+        members=1 if given.members is None else given.members,
         tests=tests,
     )
 
