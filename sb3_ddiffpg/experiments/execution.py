@@ -137,7 +137,7 @@ class RayExecutor:
             # Its workers would otherwise wait until nothing else wants a core
             os.environ.setdefault("RAY_worker_niceness", "0")
             arguments |= {"num_cpus": workers, "include_dashboard": False}
-        self._context = ray.init(**arguments)
+        ray.init(**arguments)
         self._tasks: list[Any] = []
 
     def check(self, resources: Resources) -> None:

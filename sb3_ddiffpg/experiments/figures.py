@@ -147,7 +147,6 @@ class Maps:
             for variant, run in firsts.items()
             if (run.folder / "model.zip").is_file() and issubclass(ALGOS[run.trial.algo], NoveltyActorCritic)
         }
-        self.colors = palette(runs)
         self.models: dict[str, Any] = {
             variant: ALGOS[run.trial.algo].load(_final_model(run)) for variant, run in shown.items()
         }

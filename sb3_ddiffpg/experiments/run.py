@@ -98,8 +98,7 @@ def run_suite(name: str, suite: Suite, folder: Path, executor: Executor) -> dict
     :return: Which trials failed, and why
     """
     trials = missing_trials(suite, folder)
-    n_trials = len(suite.trials())
-    view = LiveView(name, n_trials, n_trials - len(trials))
+    view = LiveView(name, suite.n_trials, suite.n_trials - len(trials))
     failed: dict[Path, BaseException] = {}
     try:
         with view.shown():
@@ -164,7 +163,7 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
             raise ValueError(f"--{name}: {value} given; accepted are whole numbers from {least} up")
     folder = given.out.resolve()
     missing = missing_trials(suite, folder)
-    print(f"{suite.description}\n{len(missing)} of {len(suite.trials())} trials to run", flush=True)
+    print(f"{suite.description}\n{len(missing)} of {suite.n_trials} trials to run", flush=True)
     if given.list:
         return partial(print, *missing, sep="\n")
     return partial(_run, given, suite, folder, bool(missing))

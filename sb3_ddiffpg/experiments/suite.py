@@ -68,6 +68,11 @@ class Suite(msgspec.Struct, forbid_unknown_fields=True):
     resources: Resources = msgspec.field(default_factory=Resources)
     ablation: str | None = None
 
+    @property
+    def n_trials(self) -> int:
+        """How many trials it has."""
+        return len(self.tasks) * len(self.variants) * len(self.seeds)
+
     def trials(self) -> dict[Path, Trial]:
         """
         :return: Folder below the results -> trial; all of the first seed come first, so that there is something of everything

@@ -87,7 +87,7 @@ def elsewhere_table(runs: Sequence[Recorded]) -> pd.DataFrame:
     :return: A row for each of these and each variant; empty if there is none
     """
     rows = []
-    for (env_id, task), _ in {(env_id, task_of(run)): None for run in runs for env_id in run.elsewhere}.items():
+    for env_id, task in dict.fromkeys((env_id, task_of(run)) for run in runs for env_id in run.elsewhere):
         for variant, own in by(variant_of, [run for run in runs if task_of(run) == task and env_id in run.elsewhere]).items():
             found = [run.elsewhere[env_id] for run in own]
             row: dict[str, str | None] = {"": variant, "trained in": task, "tested in": env_id, "seeds": str(len(own))}
