@@ -3,7 +3,7 @@ PYTHON := $(shell python3.11 -c "print('python3.11')" 2>/dev/null || echo python
 BIN := .venv/bin
 DEPENDENCIES := setup.cfg pyproject.toml constraints.txt
 
-.PHONY: demo test fast slow lint type format bench clean
+.PHONY: demo test fast slow gpu lint type format bench clean
 
 demo: .venv/.installed
 	$(BIN)/python examples/demo.py
@@ -16,6 +16,10 @@ fast: .venv/.installed-dev
 
 slow: .venv/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m slow
+
+# the tests use the CPU unless they are told otherwise
+gpu: .venv/.installed-dev
+	CUDA_VISIBLE_DEVICES=0 CUBLAS_WORKSPACE_CONFIG=:4096:8 $(BIN)/python -m pytest tests/test_accelerator.py
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff check .

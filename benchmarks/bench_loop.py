@@ -2,7 +2,8 @@
 The whole loop of training: milliseconds of wall clock for each step of all environments, by part, with different numbers of
 torch's and the simulator's threads, beside SB3's TD3 with as many updates of the same batch and hidden sizes.
 
-Usage: ``python benchmarks/bench_loop.py [--seconds 20] [--env PointMazeV1-v0 AntMazeV1-v0]``
+Usage: ``python benchmarks/bench_loop.py [--seconds 20] [--env PointMazeV1-v0 AntMazeV1-v0]``, or for a GPU, at the
+paper's sizes, ``python benchmarks/bench_loop.py --paper [--precision high]``
 """
 
 import argparse
@@ -17,6 +18,7 @@ import yaml
 from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
+from torch import nn  # noqa: F401, of the policy_kwargs
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import make_vec_env
@@ -67,17 +69,20 @@ def timed(owner: Any, method: str, name: str, times: dict[str, float]) -> None:
     setattr(owner, method, call)
 
 
-def measure(algo: str, env_id: str, torch_threads: int, simulator_threads: int, seconds: float) -> dict[str, float]:
+def measure(
+    algo: str, env_id: str, conf_file: str, torch_threads: int, simulator_threads: int, seconds: float
+) -> dict[str, float]:
     """
     :param algo: "DDiffPG" or "TD3"
     :param env_id: Of the environments
+    :param conf_file: With their settings
     :param torch_threads: Threads of torch
     :param simulator_threads: Threads that step the environments
     :param seconds: For how long
     :return: Milliseconds of a step of all environments, by part
     """
     th.set_num_threads(torch_threads)
-    path = config_file(CONFIG[env_id])
+    path = config_file(conf_file)
     assert path is not None
     entry = yaml.safe_load(path.read_text())[env_id]
     entry.pop("n_timesteps")
@@ -111,9 +116,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0, help="time spent on each row")
     parser.add_argument("--env", nargs="*", default=list(CONFIG), choices=list(CONFIG))
+    parser.add_argument("--paper", action="store_true", help="AntMazeV1-v0 with the paper's sizes, and nothing else")
+    parser.add_argument("--precision", default="highest", help="of products in 32 bits: highest, or high (TF32 on a GPU)")
     given = parser.parse_args()
+    th.set_float32_matmul_precision(given.precision)
     parts = ("simulation", "acting", "storing", "updates", "re-clustering", "environment steps/s")
     cores = os.cpu_count() or 1
+    if given.paper:
+        given.env = []
+        print("AntMazeV1-v0, the paper's sizes")
+        for name, value in measure("DDiffPG", "AntMazeV1-v0", "ddiffpg", 4, cores, given.seconds).items():
+            print(f"  {name:<20} {value:9.2f}")
     for env_id in given.env:
         print(f"\n{env_id:<14} torch simulator   " + " ".join(f"{part:>13}" for part in parts))
         counts = (
@@ -124,7 +137,7 @@ def main() -> None:
             else [(1, 1), (1, cores), (cores, cores)]
         )
         for algo, threads in [*(("DDiffPG", each) for each in counts), ("TD3", counts[0])]:
-            found = measure(algo, env_id, *threads, seconds=given.seconds)
+            found = measure(algo, env_id, CONFIG[env_id], *threads, seconds=given.seconds)
             print(f"{algo:<14} {threads[0]:5d} {threads[1]:9d}   " + " ".join(f"{found.get(part, 0):13.2f}" for part in parts))
 
 

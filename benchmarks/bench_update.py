@@ -1,12 +1,13 @@
 """
 One update of DDiffPG: its parts, beside SB3's TD3 of the same batch and hidden sizes (small networks), and beside a plain
-implementation of the same arithmetic (the paper's networks). Medians of process CPU time on one thread, all in one run.
+implementation of the same arithmetic (the paper's networks). Medians, all in one run: on a processor of the process's CPU time
+on one thread, on a GPU of the wall clock until its work is done.
 
-Only ratios carry over to another machine. Usage: ``python benchmarks/bench_update.py [--seconds 4] [--batches 256 1024 4096]``
+Only ratios carry over to another machine.
+Usage: ``python benchmarks/bench_update.py [--seconds 4] [--batches 256 1024 4096] [--device cuda]``
 """
 
 import argparse
-import time
 from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
@@ -20,7 +21,7 @@ from plain_update import PlainUpdate
 from stable_baselines3 import TD3
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
-from timing import median_ms
+from timing import clock, median_ms
 from torch import nn
 
 from sb3_ddiffpg import DDiffPG
@@ -90,15 +91,15 @@ def parts_ms(model: DDiffPG, batch_size: int, n_updates: int) -> dict[str, float
     :param model: A filled model
     :param batch_size: Transitions of an update
     :param n_updates: How many
-    :return: Median milliseconds of CPU by part
+    :return: Median milliseconds by part
     """
     times: dict[str, list[float]] = defaultdict(list)
 
     def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
-            started = time.process_time()
+            started = clock(model.device.type)
             result = function(*args, **kwargs)
-            times[name].append(time.process_time() - started)
+            times[name].append(clock(model.device.type) - started)
             return result
 
         return call
@@ -113,20 +114,29 @@ def parts_ms(model: DDiffPG, batch_size: int, n_updates: int) -> dict[str, float
     return {name: 1e3 * float(np.median(values)) for name, values in times.items()}
 
 
-def small(seconds: float) -> None:
+def print_parts(model: DDiffPG, batch_size: int) -> None:
+    """
+    :param model: A filled model
+    :param batch_size: Transitions of an update
+    """
+    for name, value in parts_ms(model, batch_size, 100).items():
+        print(f"  {name:<48} {value:9.2f}")
+
+
+def small(seconds: float, device: str) -> None:
     """
     :param seconds: Spent on it
+    :param device: Of the networks
     """
-    model = filled(4, 2, gamma=0.97, exploration_n_steps=3)
+    model = filled(4, 2, gamma=0.97, exploration_n_steps=3, device=device)
     env: Any = DummyVecEnv([lambda: Noise(4, 2)] * 20)
     hidden = dict(net_arch=[128, 128])
-    td3 = TD3("MlpPolicy", env, batch_size=256, learning_starts=10**9, buffer_size=50_000, policy_kwargs=hidden)
+    td3 = TD3("MlpPolicy", env, batch_size=256, learning_starts=10**9, buffer_size=50_000, policy_kwargs=hidden, device=device)
     td3.set_logger(configure(None, []))
     td3.learn(20_000, log_interval=10**9)
-    found = median_ms({"DDiffPG": lambda: model.train(1, 256), "TD3": lambda: td3.train(1, 256)}, seconds)
+    found = median_ms({"DDiffPG": lambda: model.train(1, 256), "TD3": lambda: td3.train(1, 256)}, seconds, device)
     print("\nsmall networks (128-128), batch 256, 2 modes                ms")
-    for name, value in parts_ms(model, 256, 100).items():
-        print(f"  {name:<48} {value:9.2f}")
+    print_parts(model, 256)
     print(f"  {'a whole update':<48} {found['DDiffPG']:9.2f}")
     print(f"  {'SB3 TD3, a whole update':<48} {found['TD3']:9.2f}   {found['DDiffPG'] / found['TD3']:.2f}x")
 
@@ -138,8 +148,9 @@ def check_equal(model: DDiffPG, plain: PlainUpdate) -> None:
     :raises AssertionError: If the two do not compute the same actions and gradients
     """
     policy = model.policy
-    features, actions = th.randn(N_MODES + 1, 64, 29), th.rand(N_MODES + 1, 64, 8) * 2 - 1
-    noise = th.randn(model.n_diffusion_steps, 64, 8)
+    device = model.device
+    features, actions = th.randn(N_MODES + 1, 64, 29, device=device), th.rand(N_MODES + 1, 64, 8, device=device) * 2 - 1
+    noise = th.randn(model.n_diffusion_steps, 64, 8, device=device)
     condition = th.cat((features[1], policy.mode_embeddings[1].expand(64, -1)), dim=1)
     with th.no_grad():
         th.testing.assert_close(
@@ -150,17 +161,19 @@ def check_equal(model: DDiffPG, plain: PlainUpdate) -> None:
     th.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-5)
 
 
-def paper(batch_size: int, seconds: float, activation: str) -> None:
+def paper(batch_size: int, seconds: float, activation: str, device: str) -> None:
     """
     :param batch_size: Transitions of an update
     :param seconds: Spent on it
     :param activation: Of the policy, "mish" as in the authors' code, or "silu"
+    :param device: Of the networks
     """
     path = config_file("ddiffpg")
     assert path is not None
     entry = yaml.safe_load(path.read_text())["paper"]
     drop = {"policy", "n_envs", "n_timesteps", "policy_kwargs", "replay_buffer_kwargs", "learning_starts", "buffer_size"}
     settings = {name: value for name, value in entry.items() if name not in drop}
+    settings |= {"device": device, "replay_buffer_kwargs": {"storage_device": "auto"}}
 
     def kwargs(activation_fn: type[nn.Module]) -> dict[str, Any]:
         sizes = dict(pi=[1024, 512, 256], qf=[512, 256, 128])
@@ -171,9 +184,16 @@ def paper(batch_size: int, seconds: float, activation: str) -> None:
     check_equal(reference, plain)
     model = filled(29, 8, **settings, policy_kwargs=kwargs(nn.Mish if activation == "mish" else nn.SiLU))
     calls = {"ours": lambda: model.train(1, batch_size), "plain": lambda: plain(batch_size)}
-    found = median_ms(calls, seconds)
+    if device != "cpu":
+        by_kernels = filled(29, 8, **settings, policy_kwargs=kwargs(nn.Mish if activation == "mish" else nn.SiLU))
+        for graph in by_kernels.graphs.values():
+            graph.enabled = False
+        calls["without graphs"] = lambda: by_kernels.train(1, batch_size)
+    found = median_ms(calls, seconds, device)
     label = f"batch {batch_size}, {activation}"
-    print(f"  {label:<24} {found['ours']:9.1f} {found['plain']:9.1f}   {found['plain'] / found['ours']:.2f}x")
+    print(
+        f"  {label:<24}", *(f"{name} {value:8.1f}" for name, value in found.items()), f"{found['plain'] / found['ours']:.2f}x"
+    )
 
 
 def main() -> None:
@@ -181,14 +201,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=4.0, help="time spent on each entry")
     parser.add_argument("--batches", type=int, nargs="*", default=[256, 1024, 4096], help="of the paper's networks")
+    parser.add_argument("--device", default="cpu", help="of the networks, such as cuda")
     given = parser.parse_args()
     th.set_num_threads(1)
     th.set_flush_denormal(True)
-    small(given.seconds)
-    print("\nthe paper's networks, 2 modes, K = 20        ours     plain ms")
+    small(given.seconds, given.device)
+    print("\nthe paper's networks, 2 modes, K = 20, ms")
     for batch_size in given.batches:
         for activation in ("mish", "silu"):
-            paper(batch_size, given.seconds, activation)
+            paper(batch_size, given.seconds, activation, given.device)
 
 
 if __name__ == "__main__":

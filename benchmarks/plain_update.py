@@ -67,8 +67,9 @@ class PlainUpdate:
         self.model = model
         groups, twins = range(model.critics.n_groups), range(model.n_critics)
         self.critics = nn.ModuleList([nn.ModuleList([PlainCritic(model.critics, g, c) for c in twins]) for g in groups])
+        self.critics.to(model.device)
         self.targets = copy.deepcopy(self.critics)
-        self.denoiser = PlainDenoiser(model.actor.diffusion.denoiser)
+        self.denoiser = PlainDenoiser(model.actor.diffusion.denoiser).to(model.device)
         self.novelty: Any = copy.deepcopy(model.novelty_model)
         self.critic_optimizers = [th.optim.AdamW(pair.parameters(), lr=5e-4, foreach=False) for pair in self.critics]
         self.actor_optimizer = th.optim.AdamW(self.denoiser.parameters(), lr=3e-4, foreach=False)
@@ -115,9 +116,7 @@ class PlainUpdate:
         model, policy = self.model, self.model.policy
         batch = model.replay_buffer.sample_modes(batch_size, model.gamma, model.exploration_n_steps, model.mode_n_steps)
         n_groups, n = batch.rows.shape
-        positions = th.as_tensor(
-            model.replay_buffer.features.of_tensors(model.replay_buffer.read_observations(batch.rows[0])[1])
-        )
+        positions = model.replay_buffer.features.of_tensors(model.replay_buffer.read_observations(batch.rows[0])[1])
         features = policy.critic_features(batch.observations).detach()
         next_features = policy.critic_features(batch.next_observations).detach()
         inputs = next_features[0] if getattr(self.novelty, "with_observation", False) else positions
@@ -127,7 +126,7 @@ class PlainUpdate:
         for group in range(n_groups):
             embedding = policy.mode_embeddings[group].expand(n, -1)
             with th.no_grad():
-                noise = th.randn(model.n_diffusion_steps, *batch.actions[group].shape)
+                noise = th.randn(model.n_diffusion_steps, *batch.actions[group].shape, device=model.device)
                 next_actions = self.denoise(th.cat((next_features[group], embedding), dim=1), noise)
                 pair: Any = self.targets[group]
                 logits = [critic(next_features[group], next_actions) for critic in pair]
@@ -156,7 +155,7 @@ class PlainUpdate:
             improved.append(actions)
         clean = th.cat(improved)
         condition = th.cat((features.flatten(0, 1), policy.mode_embeddings.repeat_interleave(n, 0)), dim=1)
-        steps = th.randint(model.n_diffusion_steps, (len(clean),))
+        steps = th.randint(model.n_diffusion_steps, (len(clean),), device=model.device)
         noise = th.randn_like(clean)
         diffusion = model.actor.diffusion
         noisy = diffusion.sqrt_alpha_bar[steps, None] * clean + diffusion.sqrt_one_minus_alpha_bar[steps, None] * noise

@@ -18,6 +18,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.critics import ModeCritics
+from sb3_ddiffpg.cuda_graphs import GraphedFunction
 from sb3_ddiffpg.features import declared_cell_size, declared_mode_features, describe_env
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, VisitCounts, noveld_reward
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
@@ -260,6 +261,7 @@ class NoveltyActorCritic(SavableAlgorithm):
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
+        self.graphs = {"critics": GraphedFunction(self._critic_gradients, self.policy, self.policy.critics.optimizer)}
 
     @property
     def critics(self) -> ModeCritics:
@@ -374,6 +376,18 @@ class NoveltyActorCritic(SavableAlgorithm):
             return positions, self.actor.features(obs)
 
     def _update_critics(self, batch: ModeBatch, rewards: th.Tensor, metrics: dict[str, list[th.Tensor]]) -> None:
+        losses, at_top = self.graphs["critics"](batch, rewards)
+        self.policy.critics.optimizer.step()
+        metrics["critic_loss"].append(losses.mean())
+        metrics[CUT_VALUES].append(at_top[0])
+
+    def _critic_gradients(self, batch: ModeBatch, rewards: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param batch: The batch
+        :param rewards: What its transitions are worth, [G, n]
+        :return: Loss of every group and share of its targets at the upper end of its values, [G] each; the gradients, clipped,
+            are left at the critics
+        """
         policy, shape = self.policy, batch.actions.shape
         with th.no_grad():
             next_actions, bonus = self._next_actions(batch)
@@ -388,9 +402,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         policy.critics.optimizer.zero_grad(set_to_none=True)
         (losses * batch.active).sum().backward()
         policy.critics.clip_gradients(self.max_grad_norm)
-        policy.critics.optimizer.step()
-        metrics["critic_loss"].append(losses.detach().mean())
-        metrics[CUT_VALUES].append(policy.critics.share_at_top(targets)[0])
+        return losses.detach(), policy.critics.share_at_top(targets)
 
     def _update_targets(self) -> None:
         policy = self.policy
@@ -513,6 +525,8 @@ class NoveltyActorCritic(SavableAlgorithm):
                 "VecNormalize scales the rewards (norm_reward=True), and so the values, which the critics' support "
                 f"[v_min={self.v_min}, v_max={self.v_max}] must cover; norm_reward=False leaves them in reward units"
             )
+        for graph in self.graphs.values():
+            graph.clear()  # settings may have changed since
         new_episodes = reset_num_timesteps or self._last_obs is None
         if new_episodes:
             self.replay_buffer.drop_unfinished_episodes()
@@ -562,7 +576,7 @@ class NoveltyActorCritic(SavableAlgorithm):
     # ------------------------------------------------------------------ saving
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor"]
+        return [*super()._excluded_save_params(), "actor", "graphs"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names = ["policy", "actor.optimizer", "policy.critics.optimizer", "novelty_model", "intrinsic_moments"]

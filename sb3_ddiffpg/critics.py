@@ -14,7 +14,7 @@ from torch.nn import functional as F
 # in the authors' code
 TWIN_TARGETS = ("lower_mean", "elementwise")
 # Rows of a group from which on it pays on a processor to go back through the lower twin only
-LARGE_ASCENT = 256
+LARGE_ASCENT = 128
 
 
 class ModeCritics(nn.Module):
@@ -196,14 +196,39 @@ class ModeCritics(nn.Module):
         parameters = [(weight[:, self.features_dim :], th.baddbmm(bias, shared, weight[:, : self.features_dim])), *others]
         if features.device.type == "cpu" and features.shape[1] >= LARGE_ASCENT:
             return partial(self._lower_twin_gradient, parameters)
+        return partial(self._masked_gradient, parameters)
 
-        def gradient(actions: th.Tensor) -> th.Tensor:
-            actions = actions.detach().requires_grad_()
-            with th.enable_grad():
-                value = self.values(self._layers(actions, parameters)[-1]).min(dim=1).values.sum()
-            return th.autograd.grad(value, actions)[0]
+    @th.no_grad()
+    def _masked_gradient(self, parameters: list[tuple[th.Tensor, th.Tensor]], actions: th.Tensor) -> th.Tensor:
+        """By hand, half of autograd's kernels: back through both twins, of which the higher one gets zeros."""
+        *hidden, logits = self._layers(actions, parameters)
+        probabilities = logits.softmax(dim=-1)
+        atoms = self.atoms[self._kind()][:, None, None, :]
+        # values() would take the softmax again
+        values = logits if self.n_atoms == 1 else (probabilities * atoms).sum(dim=-1, keepdim=True)  # [G, C, n, 1]
+        twins = th.arange(self.n_critics, device=logits.device)[:, None, None]
+        is_lower = values.argmin(dim=1, keepdim=True) == twins
+        backward = is_lower.to(logits.dtype)
+        if self.n_atoms > 1:
+            backward = probabilities * (atoms - values) * backward
+        backward = backward.flatten(0, 1)
+        for (weight, _), before in zip(parameters[:0:-1], hidden[::-1], strict=True):
+            backward = self._through_activation(th.bmm(backward, weight.mT), before.flatten(0, 1))
+        return th.bmm(backward, parameters[0][0].mT).unflatten(0, (-1, self.n_critics)).sum(dim=1)
 
-        return gradient
+    def _through_activation(self, gradient: th.Tensor, before: th.Tensor) -> th.Tensor:
+        """
+        :param gradient: Of what comes after the activation
+        :param before: What went into it, same shape
+        :return: Gradient of what went into it, same shape
+        """
+        if type(self.activation) is nn.SiLU:
+            return th.ops.aten.silu_backward(gradient, before)
+        if type(self.activation) is nn.ELU:
+            return th.ops.aten.elu_backward(gradient, self.activation.alpha, 1.0, 1.0, False, before)
+        before = before.detach().requires_grad_()
+        with th.enable_grad():
+            return th.autograd.grad(self.activation(before), before, gradient)[0]
 
     @th.no_grad()
     def _lower_twin_gradient(self, parameters: list[tuple[th.Tensor, th.Tensor]], actions: th.Tensor) -> th.Tensor:
@@ -226,12 +251,7 @@ class ModeCritics(nn.Module):
             for layer in range(len(hidden), 0, -1):
                 backward = backward @ parameters[layer][0][net].T
                 before = hidden[layer - 1][group, twin].index_select(0, rows)
-                if type(self.activation) is nn.ELU and self.activation.alpha == 1.0:
-                    backward = backward.mul_(before.clamp_(max=0.0).exp_())  # its derivative, at half autograd's price
-                else:
-                    before.requires_grad_()
-                    with th.enable_grad():
-                        backward = th.autograd.grad(self.activation(before), before, backward)[0]
+                backward = self._through_activation(backward, before)
             gradient[group].index_copy_(0, rows, backward @ parameters[0][0][net].T)
         return gradient
 

@@ -20,6 +20,7 @@ from sb3_ddiffpg.actor_critic import LARGEST_INTRINSIC, NoveltyActorCritic
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, Behavior
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.callbacks import ClusteringCallback, contains_clustering
+from sb3_ddiffpg.cuda_graphs import GraphedFunction
 from sb3_ddiffpg.features import same_selection
 from sb3_ddiffpg.history import ModeEvent, ModeHistory
 from sb3_ddiffpg.intrinsic import KnownPlaces
@@ -334,6 +335,11 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         self.known_places = KnownPlaces(self.replay_buffer.features.dim, self._visit_cell_size()).to(self.device)
         self.replay_buffer.expect_modes(len(self._modes))
 
+    def _create_aliases(self) -> None:
+        super()._create_aliases()
+        self.graphs["ascent"] = GraphedFunction(self._ascend, self.policy)
+        self.graphs["policy"] = GraphedFunction(self._policy_gradients, self.policy, self.actor.optimizer)
+
     def _resolve_mode_features(self) -> None:
         before = self._resolved_features
         super()._resolve_mode_features()
@@ -418,26 +424,34 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
 
     def _improve_target_actions(self, batch: ModeBatch) -> th.Tensor:
         """a_target <- a_target + eta * grad_a Q_i(s, a_target), K times, written back to the buffer. [G, n, action_dim]"""
+        target_actions = self.graphs["ascent"](batch)
+        self.replay_buffer.store_target_actions(batch, target_actions)
+        return target_actions
+
+    def _ascend(self, batch: ModeBatch) -> th.Tensor:
         with th.no_grad():
             features = self.policy.critic_features(batch.observations)
-        target_actions = ascend(
+        return ascend(
             self.policy.critics.action_gradient(features),
             batch.target_actions,
             learning_rate=self.action_lr,
             n_steps=self.n_action_gradient_steps,
             optimizer=self.action_optimizer,
         )
-        self.replay_buffer.store_target_actions(batch, target_actions)
-        return target_actions
 
     def _update_policy(self, batch: ModeBatch, target_actions: th.Tensor) -> th.Tensor:
+        loss = self.graphs["policy"](batch, target_actions)
+        self.actor.optimizer.step()
+        return loss
+
+    def _policy_gradients(self, batch: ModeBatch, target_actions: th.Tensor) -> th.Tensor:
+        """The denoising loss; its gradients, clipped, are left at the actor."""
         condition = self.actor.condition(batch.observations, self._row_embeddings(batch, masked=True))
         weights = batch.imitated.flatten().float()
         loss = self.actor.diffusion.loss(target_actions.flatten(0, 1), condition, weights=weights)
         self.actor.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         th.nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
-        self.actor.optimizer.step()
         return loss.detach()
 
     # ------------------------------------------------------------------ acting

@@ -200,6 +200,8 @@ class DiffusionPolicy(TwinCriticPolicy):
         :param kept: Whether it also keeps that mode's embedding (and optimiser moments), or gets new ones
         :param reset_output: Whether a mode without parent starts with a zeroed output layer
         """
+        if list(parents) == list(range(self.n_modes)) and all(kept):
+            return  # the networks stay where they are
         fresh = [not keeps for keeps in kept]
         self.critics.inherit(parents, fresh, self.critics.optimizer, reset_output)
         self.critics_target.inherit(parents, fresh, None, reset_output)

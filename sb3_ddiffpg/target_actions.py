@@ -35,8 +35,8 @@ def ascend(
         if optimizer == "normalized":
             ascent = ascent / (ascent.norm(dim=-1, keepdim=True) + 1e-8)
         elif optimizer == "adam":
-            mean = 0.9 * mean + 0.1 * ascent
-            square = 0.999 * square + 0.001 * ascent.pow(2)
-            ascent = (mean / (1 - 0.9**step)) / ((square / (1 - 0.999**step)).sqrt() + 1e-8)
-        actions = (actions + learning_rate * ascent).clamp(-ACTION_LIMIT, ACTION_LIMIT)
+            mean.lerp_(ascent, 0.1)
+            square.lerp_(ascent.square(), 0.001)
+            ascent = mean / (1 - 0.9**step) / (square / (1 - 0.999**step)).sqrt_().add_(1e-8)
+        actions = th.add(actions, ascent, alpha=learning_rate).clamp_(-ACTION_LIMIT, ACTION_LIMIT)
     return actions

@@ -1,6 +1,12 @@
 """Settings and fixtures for all tests."""
 
+import os
+
 import pytest
+
+# With a GPU at hand "auto" would mean it, and these tests ask for the same bits; what needs one is in test_accelerator.py
+os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")
+
 import torch as th
 
 # Small networks and two test processes: more threads than one only get into each other's way

@@ -9,6 +9,7 @@ from torch import nn
 
 from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, names_of
 from sb3_ddiffpg.buffers import ModeBatch
+from sb3_ddiffpg.cuda_graphs import GraphedFunction
 from sb3_ddiffpg.policies import DiffusionActor
 from sb3_ddiffpg.target_actions import ascend
 
@@ -101,6 +102,10 @@ class DIPO(Baseline):
     def _policy_arguments(self) -> dict[str, Any]:
         return {**super()._policy_arguments(), "n_diffusion_steps": self.n_diffusion_steps}
 
+    def _create_aliases(self) -> None:
+        super()._create_aliases()
+        self.graphs["ascent"] = GraphedFunction(self._ascend, self.policy)
+
     def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
         if self.own_policy_batch:
             batch = self.replay_buffer.sample_modes(batch.rows.size, self.gamma, 1, 1, env=self._vec_normalize_env)
@@ -111,15 +116,18 @@ class DIPO(Baseline):
 
     def _improve_target_actions(self, batch: ModeBatch) -> th.Tensor:
         """They climb the critics, and return to the buffer. [1, n, action_dim]"""
+        improved = self.graphs["ascent"](batch)
+        self.replay_buffer.store_target_actions(batch, improved)
+        return improved
+
+    def _ascend(self, batch: ModeBatch) -> th.Tensor:
         with th.no_grad():
             features = self.policy.critic_features(batch.observations)
         gradient = self.policy.critics.action_gradient(features)
         if self.total_gradient_ratio is not None:
             limit = self.total_gradient_ratio * batch.actions.shape[-1]
             gradient = partial(_limited, gradient, limit)
-        improved = ascend(gradient, batch.target_actions, self.action_lr, self.n_action_gradient_steps, self.action_optimizer)
-        self.replay_buffer.store_target_actions(batch, improved)
-        return improved
+        return ascend(gradient, batch.target_actions, self.action_lr, self.n_action_gradient_steps, self.action_optimizer)
 
 
 def _limited(gradient: Any, limit: float, actions: th.Tensor) -> th.Tensor:
