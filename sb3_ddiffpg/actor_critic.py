@@ -1,5 +1,6 @@
 """What all actor-critic algorithms of this package share: distributional twin critics, novelty, and the loop around them."""
 
+import uuid
 import warnings
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
@@ -9,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from scipy.signal import lfilter
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
@@ -181,6 +182,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         self.episodic_novelty = episodic_novelty
         self.max_grad_norm = max_grad_norm
 
+        self.run_id = uuid.uuid4().hex  # whose checkpoints, and modes, are meant: every run has a "mode_0"
         self.is_normalized = False
         self.visits: VisitMap | None = None
         self.env_spec: str | None = None
@@ -240,6 +242,8 @@ class NoveltyActorCritic(SavableAlgorithm):
             deviations = {} if noise is None else {"low": noise.low, "high": noise.high}
             action_dim = int(np.prod(self.action_space.shape or (1,)))
             self.action_noise = SpreadNormalActionNoise(self.n_envs, action_dim, **deviations)
+        elif type(noise) is VectorizedActionNoise and noise.n_envs != self.n_envs:
+            self.action_noise = VectorizedActionNoise(noise.base_noise, self.n_envs)
         if self.visits is None and self.replay_buffer.features.dim <= 3:
             self.visits = VisitMap(self.replay_buffer.features.dim, declared_cell_size(self.env))
         if self.env is not None:

@@ -96,7 +96,8 @@ class ModeEvalCallback(EvalCallback):
 
     def _on_step(self) -> bool:
         self._labels = set()
-        return super()._on_step()
+        with preserved_rng():
+            return super()._on_step()
 
 
 class _PeriodicCallback(BaseCallback):

@@ -1,5 +1,6 @@
 """Checkpoints of a whole run: written so that no crash loses the one before, and from which it goes on bit for bit."""
 
+import contextlib
 import errno
 import signal
 import threading
@@ -10,19 +11,35 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+)
 
 from sb3_ddiffpg.buffer_state import buffer_state, restore_buffer
 from sb3_ddiffpg.envs.snapshots import restore_vec_env, vec_env_snapshot
 from sb3_ddiffpg.model_file import model_tree
-from sb3_ddiffpg.plain_values import from_plain, to_plain
+from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
 from sb3_ddiffpg.rng import global_rng, restore_global_rng
-from sb3_ddiffpg.safe_files import convert, read, write
+from sb3_ddiffpg.safe_files import convert, read, remove_unfinished, write
 
 #: What the file says it is
 KIND = "checkpoint"
-# What SB3's EvalCallback has gathered, and writes anew to its file each time
-_EVALUATIONS = ("evaluations_timesteps", "evaluations_results", "evaluations_length", "evaluations_successes")
+NAMES = "checkpoint_*.safetensors"
+# What SB3's callbacks have gathered: numbers, and lists of them
+_GATHERED: dict[type[BaseCallback], tuple[str, ...]] = {
+    EvalCallback: (
+        *("best_mean_reward", "last_mean_reward"),
+        *("evaluations_timesteps", "evaluations_results", "evaluations_length", "evaluations_successes"),
+    ),
+    EveryNTimesteps: ("last_time_trigger",),
+    StopTrainingOnMaxEpisodes: ("n_episodes",),
+    StopTrainingOnNoModelImprovement: ("last_best_mean_reward", "no_improvement_evals"),
+}
 
 
 class _Callback(msgspec.Struct, forbid_unknown_fields=True):
@@ -54,7 +71,7 @@ def checkpoint_files(folder: str | Path) -> list[Path]:
     :param folder: Where a ``RunCheckpointCallback`` writes
     :return: Its checkpoints, the newest first
     """
-    return sorted(Path(folder).glob("checkpoint_*.safetensors"), reverse=True)
+    return sorted(Path(folder).glob(NAMES), reverse=True)
 
 
 def read_checkpoint(path: str | Path) -> tuple[Path, _Checkpoint]:
@@ -85,7 +102,11 @@ def write_checkpoint(path: Path, model: Any, callback: BaseCallback | None = Non
     :param callback: All that is called in this training
     :raises OSError: If it cannot be written; what was there before still is
     """
-    infos = [{key: float(value) for key, value in each.items()} for each in model.ep_info_buffer or ()]
+    # Other entries of a Monitor's may be anything, and nothing here reads them
+    numbers = (int, float, np.number)
+    infos = [
+        {key: float(value) for key, value in each.items() if isinstance(value, numbers)} for each in model.ep_info_buffer or ()
+    ]
     run = {
         "last_obs": model._last_obs,
         "last_original_obs": model._last_original_obs,
@@ -137,7 +158,8 @@ class InterruptedRun:
         run = self.run
         if run.environments is not None:
             model.load_episodes_tree(run.episodes)
-        model.action_noise = from_plain(run.noise)
+        with contextlib.suppress(NeededError):  # one's own kind: custom_objects had it
+            model.action_noise = from_plain(run.noise)
         known = [(each.kind, each.state) for each in run.callbacks]
         for each in _flatten(callback):
             match = next((i for i, (kind, _) in enumerate(known) if kind == type(each).__name__), None)
@@ -157,14 +179,17 @@ def _flatten(callback: BaseCallback | None) -> list[BaseCallback]:
         return []
     if isinstance(callback, CallbackList):
         return [each for child in callback.callbacks for each in _flatten(child)]
-    return [callback, *_flatten(getattr(callback, "callback", None))]
+    children = (getattr(callback, name, None) for name in ("callback", "callback_on_new_best"))
+    return [callback, *(each for child in children for each in _flatten(child))]
+
+
+def _gathered(callback: BaseCallback) -> list[str]:
+    return [name for kind, names in _GATHERED.items() if isinstance(callback, kind) for name in names]
 
 
 def _callback_state(callback: BaseCallback) -> dict[str, Any]:
     state: dict[str, Any] = {"n_calls": callback.n_calls}
-    if isinstance(callback, EvalCallback):
-        state["best_mean_reward"] = float(callback.best_mean_reward)
-        state.update({name: getattr(callback, name) for name in _EVALUATIONS})
+    state.update({name: getattr(callback, name) for name in _gathered(callback)})
     if hasattr(callback, "state_dict"):
         state["own"] = callback.state_dict()
     return state
@@ -172,12 +197,27 @@ def _callback_state(callback: BaseCallback) -> dict[str, Any]:
 
 def _load_callback_state(callback: BaseCallback, state: dict[str, Any]) -> None:
     callback.n_calls = convert(state.get("n_calls"), int, "callback.n_calls")
-    if isinstance(callback, EvalCallback) and "best_mean_reward" in state:
-        callback.best_mean_reward = convert(state["best_mean_reward"], float, "callback.best_mean_reward")
-        for name in _EVALUATIONS:
-            getattr(callback, name).extend(convert(state.get(name), list[Any], f"callback.{name}"))
+    for name in _gathered(callback):
+        value = convert(state.get(name), list[Any] | float | int, f"callback.{name}")
+        if isinstance(value, list) is not isinstance(getattr(callback, name), list):
+            raise ValueError(f"callback.{name}: {str(value)[:100]} given, where {getattr(callback, name)!r} was")
+        setattr(callback, name, value)
     if hasattr(callback, "load_state_dict") and "own" in state:
         callback.load_state_dict(state["own"])
+
+
+def _refuse_another_run(folder: Path, run_id: str) -> None:
+    """What has come furthest is the newest, so that a second run in a folder would be lost beside a longer first one."""
+    for path in checkpoint_files(folder):
+        try:
+            found = read_checkpoint(path)[1].model.get("state", {}).get("counters", {}).get("run_id")
+        except (ValueError, AttributeError):
+            continue  # damaged, and passed over by ``resume`` too
+        if found != run_id:
+            raise ValueError(
+                f"folder: {folder} holds checkpoints of another run ({path.name}): resume that one, or name another folder"
+            )
+        return
 
 
 class RunCheckpointCallback(BaseCallback):
@@ -193,7 +233,7 @@ class RunCheckpointCallback(BaseCallback):
     :param save_freq: Environment steps between two of them
     :param keep: How many of the newest stay
     :param verbose: 1 prints a line for each
-    :raises ValueError: If ``save_freq`` or ``keep`` is less than 1
+    :raises ValueError: If ``save_freq`` or ``keep`` is less than 1; when training starts, if the folder holds another run's
     """
 
     def __init__(self, folder: str | Path, save_freq: int = 100_000, keep: int = 2, verbose: int = 0) -> None:
@@ -209,6 +249,8 @@ class RunCheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
+        remove_unfinished(self.folder, NAMES)
+        _refuse_another_run(self.folder, self.model.run_id)  # type: ignore[attr-defined]
         self._last, self._signal, self._stopped = self.model.num_timesteps, None, False
         self.all_callbacks = self.locals.get("callback", self)
         if threading.current_thread() is threading.main_thread():
@@ -246,7 +288,8 @@ class RunCheckpointCallback(BaseCallback):
         try:
             write_checkpoint(path, self.model, self.all_callbacks)
         except OSError as error:
-            warnings.warn(f"No checkpoint at step {self.num_timesteps}: {error}. The ones before stay, training goes on")
+            after = "training goes on" if self._signal is None else "training ends without it"
+            warnings.warn(f"No checkpoint at step {self.num_timesteps}: {error}. The ones before stay, {after}")
             return False
         # By age: an older run may have come further
         others = sorted(

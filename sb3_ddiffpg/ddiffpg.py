@@ -3,7 +3,6 @@
 import contextlib
 import io
 import pathlib
-import uuid
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
@@ -143,7 +142,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     actor: DiffusionActor
     replay_buffer: ModeReplayBuffer
     _exploration_limit = "exploration_v_max"
-    _counters: ClassVar[dict[str, Any]] = {"n_rollouts": int, "run_id": str, "_next_mode_number": int, "_steps_before": int}
+    _counters: ClassVar[dict[str, Any]] = {"n_rollouts": int, "_next_mode_number": int, "_steps_before": int}
 
     def __init__(
         self,
@@ -291,7 +290,6 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
 
         # What a run remembers beside its networks; all of it is saved
         self.n_rollouts = 0
-        self.run_id = uuid.uuid4().hex  # whose modes are meant: every run has a "mode_0"
         self._modes: list[Mode] = []
         self._next_mode_number = 0
         self.mode_history = ModeHistory()

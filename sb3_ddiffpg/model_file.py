@@ -11,7 +11,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.utils import check_for_correct_spaces
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_ddiffpg.envs.snapshots import normalization, restore_normalization
 from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
@@ -21,6 +21,8 @@ Model = TypeVar("Model", bound=Any)
 
 #: What a file that holds a model says it is
 KIND = "model"
+# Beyond these a small file would take hours or all of the memory
+MOST_ENVS, MOST_DIFFUSION_STEPS = 2**16, 10_000
 # Of the constructor, but not the model's: given again when it is loaded
 GIVEN_AT_LOADING = {"policy", "env", "device", "tensorboard_log", "_init_setup_model"}
 
@@ -131,7 +133,10 @@ def build_model(
         raise ValueError("the policy is a class of one's own, which no file holds: give custom_objects={'policy': ...}")
     arguments = {**_arguments(saved.arguments, {**given, **changes}), **given, **changes}
     _check_sizes(arguments, saved.parameters)
+    if not 1 <= saved.n_envs <= MOST_ENVS:
+        raise ValueError(f"model.n_envs: {saved.n_envs} given; accepted is 1 to {MOST_ENVS}")
     observation_space, action_space = _space(saved.observation_space), _space(saved.action_space)
+    _check_one_hot(observation_space, saved.parameters)
     if env is not None:
         env = algorithm._wrap_env(env, 0)
         if saved.normalizer is not None:
@@ -147,7 +152,7 @@ def build_model(
         model._setup_model()
         parameters = _parameters(model, saved.parameters)
         model.set_parameters(parameters, exact_match=True, device=model.device)
-    except (TypeError, AttributeError, AssertionError, KeyError, IndexError, RuntimeError, OverflowError) as error:
+    except (TypeError, AttributeError, AssertionError, LookupError, RuntimeError, OverflowError, MemoryError) as error:
         raise ValueError(f"model: its arguments make no {algorithm.__name__}: {error!r}") from error
     return model
 
@@ -170,7 +175,10 @@ def _arguments(plain: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
 
 def _check_sizes(arguments: dict[str, Any], parameters: dict[str, dict[str, Any]]) -> None:
     """Networks cannot be larger than what is there to fill them: a small file must not ask for all of the memory."""
-    total = sum(each.size for part in parameters.values() for each in part.values() if isinstance(each, np.ndarray))
+    total = _size(parameters)
+    steps = arguments.get("n_diffusion_steps")
+    if isinstance(steps, int) and steps > MOST_DIFFUSION_STEPS:
+        raise ValueError(f"model.arguments.n_diffusion_steps: {steps} given; accepted is at most {MOST_DIFFUSION_STEPS}")
     sizes: list[int] = []
 
     def collect(value: Any) -> None:
@@ -199,6 +207,19 @@ def _check_sizes(arguments: dict[str, Any], parameters: dict[str, dict[str, Any]
     critics = arguments.get("n_critics", 1)
     if sizes and max(sizes) * (critics if isinstance(critics, int) else 1) > 64 * total + 2**20:
         raise ValueError(f"model.arguments: networks of {max(sizes)} for a file of {total} parameters")
+
+
+def _size(parameters: dict[str, dict[str, Any]]) -> int:
+    return sum(each.size for part in parameters.values() for each in part.values() if isinstance(each, np.ndarray))
+
+
+def _check_one_hot(space: spaces.Space, parameters: dict[str, dict[str, Any]]) -> None:
+    """A discrete observation becomes as many inputs as it has values, which the first layer must have weights for."""
+    parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+    inputs = sum(int(each.n) for each in parts if isinstance(each, spaces.Discrete))
+    inputs += sum(int(each.nvec.sum()) for each in parts if isinstance(each, spaces.MultiDiscrete))
+    if inputs > _size(parameters):
+        raise ValueError(f"model.observation_space: {inputs} inputs for a file of {_size(parameters)} parameters")
 
 
 # ------------------------------------------------------------------ spaces
@@ -316,17 +337,18 @@ def _normalizer_tree(env: VecNormalize) -> dict[str, Any]:
     return {"statistics": normalization(env), "settings": settings}
 
 
-def _normalized(env: Any, saved: _Normalizer) -> VecNormalize:
+def _normalized(env: Any, saved: _Normalizer) -> VecEnv:
     """The environments, normalised as those of the model were."""
     settings = {name: from_plain(value) for name, value in saved.settings.items()}
     if set(settings) != set(_NORMALIZER_SETTINGS):
         raise ValueError(f"model.normalizer: settings {sorted(settings)} given; accepted are {sorted(_NORMALIZER_SETTINGS)}")
     for name in ("clip_obs", "clip_reward", "gamma", "epsilon"):
         convert(settings[name], float, f"model.normalizer.{name}")
-    if not isinstance(env, VecNormalize):
+    normalizer = unwrap_vec_normalize(env)  # there may be wrappers around it
+    if normalizer is None:
         try:
-            env = VecNormalize(env, **settings)
+            env = normalizer = VecNormalize(env, **settings)
         except (TypeError, ValueError, AssertionError, KeyError) as error:
             raise ValueError(f"model.normalizer: {error}") from None
-    restore_normalization(env, saved.statistics)
+    restore_normalization(normalizer, saved.statistics)
     return env

@@ -33,11 +33,15 @@ class SavableAlgorithm(OffPolicyAlgorithm):
     visits: VisitMap | None
     _resolved_features: Any
     _interrupted: InterruptedRun | None = None
+    _learn_began_at = 0  # in environment steps; SB3's ``_num_timesteps_at_start`` moves when a run is resumed
+    run_id: str
     #: Attributes that are plain values, and their types
     _counters: ClassVar[dict[str, Any]] = {
         "num_timesteps": int,
         "_total_timesteps": int,
         "_num_timesteps_at_start": int,
+        "_learn_began_at": int,
+        "run_id": str,
         "_episode_num": int,
         "_n_updates": int,
         "_current_progress_remaining": float,
@@ -60,8 +64,10 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         See SB3's ``learn``. The first call after ``resume`` does what was left of the interrupted one.
         """
         if self._interrupted is not None:
-            done = self.num_timesteps - (0 if reset_num_timesteps else self._num_timesteps_at_start)
+            done = self.num_timesteps - self._learn_began_at
             total_timesteps, reset_num_timesteps = max(0, total_timesteps - done), False
+        else:
+            self._learn_began_at = 0 if reset_num_timesteps else self.num_timesteps
         with handlers_restored():
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
@@ -157,6 +163,8 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         :raises FileNotFoundError: If there is no checkpoint
         :raises ValueError: If none is whole, or it does not fit
         """
+        if env is None:
+            raise ValueError("env=None given; accepted are the environments to go on in, made as the run's")
         _, checkpoint = read_checkpoint(path)
         model = build_model(cls, checkpoint.model, env, device, custom_objects, **kwargs)
         model._interrupted = InterruptedRun(checkpoint.run)

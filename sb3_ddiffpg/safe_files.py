@@ -5,6 +5,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,8 @@ def write(path: Path, kind: str, tree: Any) -> None:
             os.fsync(file.fileno())
         os.replace(unfinished, path)
     except SafetensorError as error:  # it says so for whatever the system refuses
-        number = errno.ENOSPC if "os error 28" in str(error) else errno.EIO
+        named = re.search(r"os error (\d+)", str(error))
+        number = int(named[1]) if named else errno.EIO
         raise OSError(number, f"{os.strerror(number)} ({error})", str(path)) from None
     finally:
         with contextlib.suppress(OSError):
@@ -81,6 +83,29 @@ def read(path: Path, kind: str) -> Any:
         return _unpack(json.loads(text), arrays)
     except (ValueError, RecursionError, KeyError) as error:
         raise ValueError(f"{path} is damaged: {error}") from None
+
+
+def remove_unfinished(folder: Path, names: str) -> None:
+    """
+    What writers left behind that were killed.
+
+    :param folder: Where they wrote
+    :param names: Pattern of the files' names
+    """
+    for path in folder.glob(f".{names}.*"):
+        number = path.suffix[1:]
+        if number.isdecimal() and path.is_file() and not _is_running(int(number)):
+            path.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def convert(tree: Any, schema: Any, what: str) -> Any:
@@ -132,7 +157,9 @@ def _pack(tree: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
         for key in tree:
             if not isinstance(key, str) or key.startswith("$"):
                 raise TypeError(f"{place}: keys must be strings without '$' in front, got {key!r}")
-        return {key: _pack(value, f"{place}/{key}", arrays) for key, value in tree.items()}
+        # As in JSON pointers, so that {"a/b": x} and {"a": {"b": y}} are two places
+        names = {key: key.replace("~", "~0").replace("/", "~1") for key in tree}
+        return {key: _pack(value, f"{place}/{names[key]}", arrays) for key, value in tree.items()}
     if isinstance(tree, Sequence):
         return [_pack(value, f"{place}/{i}", arrays) for i, value in enumerate(tree)]
     raise TypeError(f"{place}: {tree!r} of {type(tree)} cannot be saved")

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -9,9 +11,17 @@ import numpy as np
 import pytest
 import torch as th
 from environments import SMALL, TwoEnds, assert_same_state, state_of
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+)
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 from test_resume import assert_same_buffer
 
@@ -266,10 +276,140 @@ def test_no_reader_sees_half_a_file(tmp_path):
     assert seen and set(seen) == {model.num_timesteps}
 
 
-def test_a_new_run_keeps_its_checkpoint_beside_those_of_a_longer_one(tmp_path):
-    model_for(known_ends()).learn(400, callback=RunCheckpointCallback(tmp_path, save_freq=100, keep=2))
-    model_for(known_ends(), seed=5).learn(250, callback=RunCheckpointCallback(tmp_path, save_freq=100, keep=2))
-    assert max(int(path.stem.split("_")[1]) for path in checkpoint_files(tmp_path)) < 300
+def test_a_new_run_is_refused_beside_the_checkpoints_of_another(tmp_path):
+    """The longer one would be taken for the newer one."""
+    first = model_for(known_ends())
+    first.learn(400, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+    before = {path: path.read_bytes() for path in checkpoint_files(tmp_path)}
+    with pytest.raises(ValueError, match="holds checkpoints of another run .*: resume that one, or name another folder"):
+        model_for(known_ends()).learn(250, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+    assert {path: path.read_bytes() for path in checkpoint_files(tmp_path)} == before
+    first.learn(100, reset_num_timesteps=False, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+
+
+def test_what_a_killed_writer_left_is_swept_away(tmp_path):
+    """But not what another process is about to finish, nor other files."""
+    finished = subprocess.Popen([sys.executable, "-c", ""])
+    finished.wait()
+    left = tmp_path / f".checkpoint_000000000100.safetensors.{finished.pid}"
+    kept = [tmp_path / f".checkpoint_000000000200.safetensors.{os.getpid()}", tmp_path / f".notes.{finished.pid}"]
+    for path in (left, *kept):
+        path.write_bytes(b"half")
+    model_for(known_ends()).learn(50, callback=RunCheckpointCallback(tmp_path))
+    assert not left.exists() and all(path.exists() for path in kept)
+
+
+def test_what_a_monitor_notes_may_be_anything(tmp_path):
+    def make_env():
+        env = DummyVecEnv([lambda: Monitor(KnownEnds(), info_keywords=("kind",))] * 4)
+        env.seed(3)
+        return env
+
+    step = KnownEnds.step
+    try:
+        KnownEnds.step = lambda self, action: (*step(self, action)[:4], {**step(self, action)[4], "kind": "a word"})
+        model = model_for(make_env())
+        model.learn(200, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+    finally:
+        KnownEnds.step = step
+    assert any(each["kind"] == "a word" for each in model.ep_info_buffer)
+    resumed = DDiffPG.resume(tmp_path, make_env())
+    assert [each["r"] for each in resumed.ep_info_buffer] == [each["r"] for each in model.ep_info_buffer]
+
+
+def test_a_call_that_adds_steps_is_resumed_twice(tmp_path):
+    model = model_for(known_ends())
+    model.learn(200)
+    callback = RunCheckpointCallback(tmp_path, save_freq=100, keep=10)
+    model.learn(400, reset_num_timesteps=False, callback=callback)
+    expected = outcome(model)
+    for path in checkpoint_files(tmp_path)[::-1][:2]:
+        interrupted = silent(DDiffPG.resume(path, known_ends()))
+        folder = tmp_path / path.stem
+        interrupted.learn(400, reset_num_timesteps=False, callback=RunCheckpointCallback(folder, save_freq=100, keep=10))
+        again = silent(DDiffPG.resume(checkpoint_files(folder)[-1], known_ends()))
+        assert again.num_timesteps < 600
+        again.learn(400, reset_num_timesteps=False)
+        assert outcome(again) == expected
+
+
+def test_the_call_after_the_resumed_one_is_the_same_too(tmp_path):
+    """Environments that were just made would draw the first episode's start anew."""
+    model = model_for(known_ends())
+    model.learn(200, callback=RunCheckpointCallback(tmp_path, save_freq=100, keep=10))
+    resumed = silent(DDiffPG.resume(checkpoint_files(tmp_path)[-1], known_ends()))
+    resumed.learn(200)
+    outcomes = []
+    for each in (model, resumed):
+        set_random_seed(7)
+        each.learn(100)
+        outcomes.append(outcome(each))
+    assert outcomes[0] == outcomes[1]
+    assert_same_state(state_of(resumed), state_of(model))
+
+
+@pytest.mark.parametrize("kind", ["episodes", "steps", "improvement"])
+def test_what_callbacks_count_goes_on(tmp_path, kind):
+    """They stop or act where they would have in an uninterrupted run."""
+    acted = []
+
+    class Notes(BaseCallback):
+        def _on_step(self):
+            acted.append(self.model.num_timesteps)
+            return True
+
+    def callbacks(folder):
+        others = {
+            "episodes": [StopTrainingOnMaxEpisodes(max_episodes=10)],
+            "steps": [EveryNTimesteps(90, Notes())],
+            "improvement": [
+                EvalCallback(
+                    known_ends(1), callback_on_new_best=Notes(), n_eval_episodes=1, eval_freq=20, verbose=0,
+                    callback_after_eval=StopTrainingOnNoModelImprovement(2, min_evals=1),
+                )
+            ],
+        }  # fmt: skip
+        return [*others[kind], RunCheckpointCallback(folder, save_freq=50, keep=20)]
+
+    whole = model_for(known_ends())
+    whole.learn(400, callback=callbacks(tmp_path / "whole"))
+    expected, end = list(acted), whole.num_timesteps
+    files = checkpoint_files(tmp_path / "whole")[::-1]
+    assert expected or end < 400
+    for path in files[1:-1:2]:
+        acted.clear()
+        resumed = silent(DDiffPG.resume(path, known_ends()))
+        began = resumed.num_timesteps
+        resumed.learn(400, callback=callbacks(tmp_path / path.stem))
+        assert resumed.num_timesteps == end
+        assert acted == [step for step in expected if step > began]
+
+
+def test_noise_of_ones_own_is_kept(tmp_path):
+    class Own(NormalActionNoise):
+        pass
+
+    noise = Own(np.zeros(1), 0.1 * np.ones(1))
+    model = model_for(known_ends(), action_noise=noise)
+    model.learn(120, callback=RunCheckpointCallback(tmp_path, save_freq=50))
+    resumed = silent(DDiffPG.resume(tmp_path, known_ends(), custom_objects={"action_noise": noise}))
+    resumed.learn(150)
+    assert isinstance(resumed.action_noise, VectorizedActionNoise)
+    assert all(isinstance(each, Own) for each in resumed.action_noise.noises)
+
+
+def test_vectorised_noise_follows_the_number_of_environments(tmp_path):
+    model = model_for(known_ends(4), action_noise=NormalActionNoise(np.zeros(1), 0.1 * np.ones(1)))
+    model.learn(60)
+    model.save(tmp_path / "model.zip")
+    loaded = silent(DDiffPG.load(tmp_path / "model.zip", env=known_ends(2)))
+    loaded.learn(60)
+    assert len(loaded.action_noise.noises) == 2
+
+
+def test_environments_to_go_on_in_are_asked_for(tmp_path):
+    with pytest.raises(ValueError, match="env=None given; accepted are the environments"):
+        DDiffPG.resume(tmp_path, None)
 
 
 def test_a_random_state_that_numpy_would_crash_with_is_refused():

@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from safetensors.numpy import load_file, save_file
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES
@@ -324,6 +324,52 @@ def read_back(model):
         return node.detach().numpy().copy() if isinstance(node, th.Tensor) else node
 
     return copy(tree)
+
+
+def test_names_with_slashes_are_not_mixed_up(tmp_path):
+    tree = {"a/b": np.zeros(2), "a": {"b": np.ones(3), "~1": np.ones(1)}, "a~1b": np.ones(4), "a~": {"1b": np.ones(5)}}
+    write(tmp_path / "file", "model", tree)
+    found = read(tmp_path / "file", "model")
+    assert [len(each) for each in (found["a/b"], found["a"]["b"], found["a"]["~1"], found["a~1b"], found["a~"]["1b"])] == [
+        *(2, 3, 1, 4, 5)
+    ]
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError, match="No such file or directory"):
+        write(tmp_path / "nowhere" / "file", "model", {"a": np.zeros(2)})
+
+
+def test_normalisation_below_another_wrapper_is_found(tmp_path):
+    """A second one around it would normalise twice."""
+    env = VecNormalize(DummyVecEnv([TwoEnds] * 2), norm_reward=False)
+    model = small_model(env)
+    model.learn(60)
+    model.export(tmp_path / "model")
+    below = VecNormalize(DummyVecEnv([TwoEnds] * 2), norm_reward=False)
+    loaded = DDiffPG.load(tmp_path / "model", env=VecMonitor(below), safe=True)
+    assert loaded.get_vec_normalize_env() is below
+    np.testing.assert_array_equal(below.obs_rms.mean, env.obs_rms.mean)
+
+
+@pytest.mark.parametrize(
+    "place, value, message",
+    [
+        (("n_envs",), 10**9, "model.n_envs: 1000000000 given; accepted is 1 to 65536"),
+        (("n_envs",), 0, "model.n_envs: 0 given"),
+        (("arguments", "n_diffusion_steps"), 10**7, "n_diffusion_steps"),
+        (("observation_space",), {"kind": "Discrete", "n": [10**9, 0]}, "model.observation_space: 1000000000 inputs"),
+        (("observation_space",), {"kind": "MultiDiscrete", "n": [10**8, 10**8]}, "model.observation_space: 200000000 inputs"),
+    ],
+)
+def test_a_small_file_cannot_ask_for_hours_or_gigabytes(trained, place, value, message):
+    tree = read_back(trained)
+    node = tree
+    for key in place[:-1]:
+        node = node[key]
+    node[place[-1]] = value
+    with pytest.raises(ValueError, match=message):
+        build_model(DDiffPG, tree)
 
 
 def test_a_small_file_cannot_ask_for_all_of_the_memory(trained):

@@ -126,6 +126,9 @@ def restore_vec_env(env: VecEnv, tree: Any) -> None:
             raise ValueError(f"environments: {len(states)} saved, there are {core.num_envs}")
         for each, state in zip(core.envs, states, strict=True):
             restore_env(each, state)
+        # What a new one is made with waits for its first reset, which this one has had
+        core._reset_seeds()
+        core._reset_options()
     elif hasattr(core, "load_state_dict"):
         core.load_state_dict(snapshot.core)
     else:
