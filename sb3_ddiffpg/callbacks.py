@@ -13,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import Figure
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_ddiffpg.checkpoints import nested_callbacks
 from sb3_ddiffpg.episodes import run_episodes
 from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
 from sb3_ddiffpg.history import ModeEvent
@@ -67,10 +68,7 @@ def contains_clustering(callback: BaseCallback) -> bool:
     :param callback: A callback, perhaps with others inside
     :return: Whether one of them is a ``ClusteringCallback``
     """
-    if isinstance(callback, ClusteringCallback):
-        return True
-    children = getattr(callback, "callbacks", []) or [getattr(callback, "callback", None)]
-    return any(contains_clustering(child) for child in children if isinstance(child, BaseCallback))
+    return any(isinstance(each, ClusteringCallback) for each in nested_callbacks(callback))
 
 
 class ModeEvalCallback(EvalCallback):

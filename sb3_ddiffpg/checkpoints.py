@@ -118,7 +118,7 @@ def write_checkpoint(path: Path, model: Any, callback: BaseCallback | None = Non
         "environments": vec_env_snapshot(model.env),
         "buffer": buffer_state(model.replay_buffer),
         "random": global_rng(),
-        "callbacks": [{"kind": type(each).__name__, "state": _callback_state(each)} for each in _flatten(callback)],
+        "callbacks": [{"kind": type(each).__name__, "state": _callback_state(each)} for each in nested_callbacks(callback)],
     }
     write(path, KIND, {"model": model_tree(model), "run": run})
 
@@ -161,7 +161,7 @@ class InterruptedRun:
         with contextlib.suppress(NeededError):  # one's own kind: custom_objects had it
             model.action_noise = from_plain(run.noise)
         known = [(each.kind, each.state) for each in run.callbacks]
-        for each in _flatten(callback):
+        for each in nested_callbacks(callback):
             match = next((i for i, (kind, _) in enumerate(known) if kind == type(each).__name__), None)
             if match is not None:
                 _load_callback_state(each, known.pop(match)[1])
@@ -174,13 +174,17 @@ def _observation(value: Any) -> Any:
     return None if value is None else convert(value, np.ndarray, "last_obs")
 
 
-def _flatten(callback: BaseCallback | None) -> list[BaseCallback]:
+def nested_callbacks(callback: BaseCallback | None) -> list[BaseCallback]:
+    """
+    :param callback: A callback, perhaps with others inside; None: none
+    :return: It and those inside, a list itself not counted
+    """
     if callback is None:
         return []
     if isinstance(callback, CallbackList):
-        return [each for child in callback.callbacks for each in _flatten(child)]
+        return [each for child in callback.callbacks for each in nested_callbacks(child)]
     children = (getattr(callback, name, None) for name in ("callback", "callback_on_new_best"))
-    return [callback, *(each for child in children for each in _flatten(child))]
+    return [callback, *(each for child in children for each in nested_callbacks(child))]
 
 
 def _gathered(callback: BaseCallback) -> list[str]:
