@@ -54,8 +54,8 @@ class ModeCritics(nn.Module):
         twin_target: str = "lower_mean",
     ) -> None:
         super().__init__()
-        if not net_arch:
-            raise ValueError("net_arch['qf'] must name at least one hidden layer, got []")
+        if not net_arch or min(net_arch) < 1:
+            raise ValueError(f"net_arch['qf'] must name at least one hidden layer, of at least one unit each, got {net_arch}")
         self.n_critics, self.n_atoms, self.twin_target = n_critics, n_atoms, twin_target
         self.features_dim, self.action_dim = features_dim, action_dim
         self.activation = activation_fn()

@@ -87,8 +87,8 @@ class Denoiser(nn.Module):
         time_embedding_dim: int = 32,
     ) -> None:
         super().__init__()
-        if not net_arch:
-            raise ValueError("net_arch['pi'] must name at least one hidden layer, got []")
+        if not net_arch or min(net_arch) < 1:
+            raise ValueError(f"net_arch['pi'] must name at least one hidden layer, of at least one unit each, got {net_arch}")
         width = net_arch[0]
         self.time_mlp = nn.Sequential(
             SinusoidalEmbedding(time_embedding_dim),

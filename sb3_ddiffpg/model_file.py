@@ -152,7 +152,7 @@ def build_model(
         model._setup_model()
         parameters = _parameters(model, saved.parameters)
         model.set_parameters(parameters, exact_match=True, device=model.device)
-    except (TypeError, AttributeError, AssertionError, LookupError, RuntimeError, OverflowError, MemoryError) as error:
+    except (TypeError, AttributeError, AssertionError, LookupError, RuntimeError, ArithmeticError, MemoryError) as error:
         raise ValueError(f"model: its arguments make no {algorithm.__name__}: {error!r}") from error
     return model
 

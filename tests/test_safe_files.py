@@ -358,11 +358,12 @@ def test_normalisation_below_another_wrapper_is_found(tmp_path):
         (("n_envs",), 10**9, "model.n_envs: 1000000000 given; accepted is 1 to 65536"),
         (("n_envs",), 0, "model.n_envs: 0 given"),
         (("arguments", "n_diffusion_steps"), 10**7, "n_diffusion_steps"),
+        (("arguments", "policy_kwargs"), {"dict": {"net_arch": [0]}}, "of at least one unit each"),
         (("observation_space",), {"kind": "Discrete", "n": [10**9, 0]}, "model.observation_space: 1000000000 inputs"),
         (("observation_space",), {"kind": "MultiDiscrete", "n": [10**8, 10**8]}, "model.observation_space: 200000000 inputs"),
     ],
 )
-def test_a_small_file_cannot_ask_for_hours_or_gigabytes(trained, place, value, message):
+def test_a_file_cannot_ask_for_sizes_that_make_no_model(trained, place, value, message):
     tree = read_back(trained)
     node = tree
     for key in place[:-1]:

@@ -359,7 +359,9 @@ def test_network_architectures(net_arch):
     assert widths == [*actor[1:], 1] and model.actor.diffusion.denoiser.action_in.out_features == actor[0]
 
 
-@pytest.mark.parametrize("net_arch", [[], {"pi": [], "qf": [4]}, {"pi": [4], "qf": []}])
+@pytest.mark.parametrize(
+    "net_arch", [[], {"pi": [], "qf": [4]}, {"pi": [4], "qf": []}, [0], [4, -1], {"pi": [4, 0], "qf": [4]}]
+)
 def test_networks_without_hidden_layer_are_refused(net_arch):
     with pytest.raises(ValueError, match="net_arch.*at least one hidden layer"):
         small_model(TwoEnds(), policy_kwargs={"net_arch": net_arch})
