@@ -14,7 +14,7 @@ from filelock import FileLock
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.evaluation import ModeEvaluation
 from sb3_ddiffpg.experiments import __main__ as cli
-from sb3_ddiffpg.experiments.curve import CurveCallback
+from sb3_ddiffpg.experiments.curve import Clock, CurveCallback
 
 SMALL = "{n_timesteps: 1600, learning_starts: 320, n_envs: 4, policy_kwargs: 'dict(net_arch=[16])'}"
 
@@ -50,6 +50,17 @@ def test_a_run_leaves_its_record_and_can_be_repeated(monkeypatch, tmp_path, caps
     with pytest.raises(SystemExit):
         record(monkeypatch, tmp_path / "a", "--env", "PointMazeV1-v0", "--seed", "6", "--override", SMALL)
     assert "holds another training" in capsys.readouterr().err
+
+
+def test_a_simulators_processes_count_as_the_runs():
+    """While they run, and after they have ended."""
+    burn = "import time\nwhile time.process_time() < 0.5: pass\nprint(time.process_time(), flush=True)\ninput()"
+    clock = Clock(cpu_hours=1.0)
+    with subprocess.Popen([sys.executable, "-c", burn], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as worker:
+        used = float(worker.stdout.readline())
+        assert used - 0.05 <= 3600 * (clock.cpu_hours - 1) <= used + 0.4
+        worker.communicate("\n")
+    assert used - 0.05 <= 3600 * (clock.cpu_hours - 1) <= used + 0.4
 
 
 def test_a_run_that_was_killed_goes_on(monkeypatch, tmp_path):

@@ -1,10 +1,14 @@
 """A training's learning curve: tests along the way, and what had been reached by then."""
 
 import csv
+import os
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from sb3_ddiffpg.callbacks import EvaluateModesCallback
 from sb3_ddiffpg.experiments.wall_clock import Stopwatch
@@ -21,7 +25,7 @@ class Clock:
     """
 
     def __init__(self, hours: float = 0.0, cpu_hours: float = 0.0) -> None:
-        self._began, self._cpu = time.perf_counter() - 3600 * hours, time.process_time() - 3600 * cpu_hours
+        self._began, self._cpu = time.perf_counter() - 3600 * hours, self._cpu_seconds() - 3600 * cpu_hours
 
     @property
     def hours(self) -> float:
@@ -30,8 +34,16 @@ class Clock:
 
     @property
     def cpu_hours(self) -> float:
-        """Of this process."""
-        return (time.process_time() - self._cpu) / 3600
+        """Of this process and of those that it began, such as a simulator's workers."""
+        return (self._cpu_seconds() - self._cpu) / 3600
+
+    @staticmethod
+    def _cpu_seconds() -> float:
+        seconds = sum(os.times()[:4])  # children are in it when they have ended
+        for child in psutil.Process().children(recursive=True):
+            with suppress(psutil.Error):  # it has just ended
+                seconds += sum(child.cpu_times()[:4])
+        return seconds
 
 
 class CurveCallback(EvaluateModesCallback):
