@@ -20,6 +20,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.cuda_graphs import GraphedFunction
+from sb3_ddiffpg.divergence import EXPLODED, DivergenceWatch
 from sb3_ddiffpg.features import declared_cell_size, declared_mode_features, describe_env
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, VisitCounts, noveld_reward
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
@@ -266,6 +267,8 @@ class NoveltyActorCritic(SavableAlgorithm):
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
         self.graphs = {"critics": GraphedFunction(self._critic_gradients, self.policy, self.policy.critics.optimizer)}
+        span = (self.critics.upper - self.critics.lower).max().item()
+        self.divergence_watch = DivergenceWatch(self.device, EXPLODED * max(1.0, span**2))
 
     @property
     def critics(self) -> ModeCritics:
@@ -295,6 +298,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         self._update_learning_rates()
 
     def _end_updates(self, gradient_steps: int, metrics: dict[str, list[th.Tensor]]) -> None:
+        self.divergence_watch.report()
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         means = {name: th.stack(values).mean().item() for name, values in metrics.items()}
@@ -336,7 +340,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         present = windows >= 0
         inputs = [self._novelty_inputs(obs) for obs in self.replay_buffer.read_observations(windows[present])]
         now, then = (self.novelty_model.novelty(*each) for each in inputs)
-        reward = noveld_reward(now, then, self.novelty_scale)
+        reward = self.divergence_watch.finite("the novelty", noveld_reward(now, then, self.novelty_scale), 0.0)
         reward = reward * self._pays(windows, present, inputs[1][0])
         metrics["intrinsic_reward"].append(reward.mean())
         if self.normalize_intrinsic:
@@ -381,9 +385,13 @@ class NoveltyActorCritic(SavableAlgorithm):
 
     def _update_critics(self, batch: ModeBatch, rewards: th.Tensor, metrics: dict[str, list[th.Tensor]]) -> None:
         losses, at_top = self.graphs["critics"](batch, rewards)
-        self.policy.critics.optimizer.step()
+        self.divergence_watch.step(self._critic_names(), self.policy.critics.optimizer, losses)
         metrics["critic_loss"].append(losses.mean())
         metrics[CUT_VALUES].append(at_top[0])
+
+    def _critic_names(self) -> list[str]:
+        """How an error calls the critics of each group."""
+        return ["critics"]
 
     def _critic_gradients(self, batch: ModeBatch, rewards: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -580,7 +588,7 @@ class NoveltyActorCritic(SavableAlgorithm):
     # ------------------------------------------------------------------ saving
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "graphs"]
+        return [*super()._excluded_save_params(), "actor", "graphs", "divergence_watch"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names = ["policy", "actor.optimizer", "policy.critics.optimizer", "novelty_model", "intrinsic_moments"]

@@ -371,6 +371,9 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             self._update_targets()
         self._end_updates(gradient_steps, metrics)
 
+    def _critic_names(self) -> list[str]:
+        return ["exploratory critics", *(f"critics of {mode.name!r}" for mode in self._modes)]
+
     def _rewards(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> th.Tensor:
         """Intrinsic reward for the exploratory group, the environment's (and some intrinsic) for the modes, [G, n]."""
         everywhere = self.mode_intrinsic_coef != 0.0
@@ -423,6 +426,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     def _improve_target_actions(self, batch: ModeBatch) -> th.Tensor:
         """a_target <- a_target + eta * grad_a Q_i(s, a_target), K times, written back to the buffer. [G, n, action_dim]"""
         target_actions = self.graphs["ascent"](batch)
+        target_actions = self.divergence_watch.finite("a target action", target_actions, batch.target_actions)
         self.replay_buffer.store_target_actions(batch, target_actions)
         return target_actions
 
@@ -439,7 +443,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
 
     def _update_policy(self, batch: ModeBatch, target_actions: th.Tensor) -> th.Tensor:
         loss = self.graphs["policy"](batch, target_actions)
-        self.actor.optimizer.step()
+        self.divergence_watch.step("actor", self.actor.optimizer, loss)
         return loss
 
     def _policy_gradients(self, batch: ModeBatch, target_actions: th.Tensor) -> th.Tensor:

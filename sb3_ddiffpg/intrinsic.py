@@ -7,6 +7,8 @@ import numpy as np
 import torch as th
 from torch import nn
 
+from sb3_ddiffpg.divergence import step_unless
+
 
 def noveld_reward(novelty: th.Tensor, next_novelty: th.Tensor, scale: float) -> th.Tensor:
     """
@@ -142,7 +144,7 @@ class RandomNetworkDistillation(nn.Module):
         loss = (self.predictor(inputs) - target).pow(2).mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        self.optimizer.step()
+        step_unless(~loss.isfinite(), self.optimizer)
         return loss.detach()
 
 

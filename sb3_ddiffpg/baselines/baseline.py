@@ -108,7 +108,7 @@ class Baseline(NoveltyActorCritic):
         self.actor.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         th.nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
-        self.actor.optimizer.step()
+        self.divergence_watch.step("actor", self.actor.optimizer, loss)
         return loss.detach()
 
     def _values(self, batch: ModeBatch, actions: th.Tensor) -> th.Tensor:

@@ -117,6 +117,7 @@ class DIPO(Baseline):
     def _improve_target_actions(self, batch: ModeBatch) -> th.Tensor:
         """They climb the critics, and return to the buffer. [1, n, action_dim]"""
         improved = self.graphs["ascent"](batch)
+        improved = self.divergence_watch.finite("a target action", improved, batch.target_actions)
         self.replay_buffer.store_target_actions(batch, improved)
         return improved
 

@@ -460,7 +460,8 @@ class RPG(NoveltyActorCritic):
         policy.critics.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         th.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
-        policy.critics.optimizer.step()
+        # Rewards that it predicts need not lie within the values' support
+        self.divergence_watch.step("model", policy.critics.optimizer, loss, bounded=False)
         for name, mean in means.items():
             metrics[f"{name}_loss"].append(mean.detach())
 
@@ -477,12 +478,12 @@ class RPG(NoveltyActorCritic):
         loss.backward()
         for part in (self.actor, policy.inference):
             th.nn.utils.clip_grad_norm_(part.parameters(), self.max_grad_norm)
-        self.actor.optimizer.step()
+        self.divergence_watch.step("actor", self.actor.optimizer, loss, bounded=False)
         target = -float(segments.actions.shape[-1]) if self.target_entropy is None else self.target_entropy
         entropy_loss = -(policy.log_entropy_coef * (log_probabilities.detach() + target)).mean()
         self.entropy_optimizer.zero_grad()
         entropy_loss.backward()
-        self.entropy_optimizer.step()
+        self.divergence_watch.step("entropy's factor", self.entropy_optimizer, entropy_loss)
         metrics["actor_loss"].append(-returns.mean().detach())
         metrics["latent_information"].append(ratios.mean().detach())
         metrics["entropy_coef"].append(self.entropy_coef)

@@ -146,7 +146,7 @@ class SACC51(Baseline):
         metrics["actor_loss"].append(self._step_actor((self.entropy_coef * log_probabilities - values).mean()))
         self.entropy_optimizer.zero_grad()
         entropy_loss.backward()
-        self.entropy_optimizer.step()
+        self.divergence_watch.step("entropy's factor", self.entropy_optimizer, entropy_loss)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()

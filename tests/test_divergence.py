@@ -1,0 +1,153 @@
+"""Training that diverges is stopped, named by part, and leaves nothing behind."""
+
+import math
+
+import numpy as np
+import pytest
+import torch as th
+from environments import TwoEnds, small_model
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch import nn
+
+from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.baselines import BASELINES, RPG, SACC51
+from sb3_ddiffpg.divergence import DivergedError, DivergenceWatch, step_unless
+
+ALGORITHMS = {"ddiffpg": DDiffPG, **BASELINES}
+
+
+def trained(algorithm, **changes):
+    settings = {"learning_starts": 40, "buffer_size": 2000, "batch_size": 32, "train_freq": 4, "seed": 0}
+    env = DummyVecEnv([TwoEnds] * 4)
+    model = algorithm("MlpPolicy", env, **{"policy_kwargs": {"net_arch": [16]}, **settings, **changes})
+    model.set_logger(Logger(None, []))
+    return model.learn(80)
+
+
+def parts_of(model):
+    """Name in the error -> a parameter that the part learns."""
+    critics = model.critics.stacked_parameters()
+    parts = {"model" if isinstance(model, RPG) else "critics": critics[0]}
+    parts["actor"] = next(iter(model.actor.optimizer.param_groups[0]["params"]))
+    if isinstance(model, RPG | SACC51):
+        parts["entropy's factor"] = model.policy.log_entropy_coef
+    return parts
+
+
+def state_of(model):
+    tensors = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
+    for number, optimizer in enumerate((model.actor.optimizer, model.policy.critics.optimizer)):
+        for index, state in enumerate(optimizer.state_dict()["state"].values()):
+            tensors |= {f"optimizer {number} {index} {key}": value.clone() for key, value in state.items()}
+    return tensors
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_gradient_that_is_no_number_stops_training_and_changes_nothing_of_its_part(name, value):
+    model = trained(ALGORITHMS[name])
+    for part, parameter in parts_of(model).items():
+        hook = parameter.register_hook(lambda gradient: th.full_like(gradient, value))
+        before = parameter.detach().clone()
+        with pytest.raises(DivergedError, match=f"the gradient of the .*{part}.* is"):
+            model.train(1, 32)
+        hook.remove()
+        assert th.equal(parameter, before)
+        assert all(tensor.isfinite().all() for tensor in state_of(model).values())
+        model.train(1, 32)  # goes on
+    assert model.learn(40, reset_num_timesteps=False)._n_updates > 0
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_an_overflow_within_an_update_is_noticed_by_that_update(name):
+    """Weights so large that the critics' loss cannot be told in 32 bits."""
+    model = trained(ALGORITHMS[name], n_atoms=1)
+    parameter = model.critics.stacked_parameters()[0]
+    with th.no_grad():
+        parameter.fill_(1e30)
+    before = state_of(model)
+    with pytest.raises(DivergedError, match="Training has diverged: the loss of the "):
+        model.train(1, 32)
+    for key, tensor in state_of(model).items():
+        assert th.equal(tensor, before[key]), key
+
+
+def test_an_exploding_loss_is_noticed_before_it_overflows():
+    model = trained(DDiffPG, n_atoms=1, v_max=5.0, exploration_v_max=5.0)
+    with th.no_grad():
+        model.critics.biases[-1].fill_(2.5e3)  # 500 supports away: unwise, no more
+    model.train(1, 32)
+    with th.no_grad():
+        model.critics.biases[-1].fill_(4e4)
+    # Twins: 2 * 40000^2
+    with pytest.raises(DivergedError, match=r"the loss of the exploratory critics is 3\.\d+e\+09"):
+        model.train(1, 32)
+
+
+def test_the_mode_at_fault_is_named():
+    model = small_model(DummyVecEnv([TwoEnds] * 4), n_atoms=1).learn(600)
+    assert len(model.modes) >= 2
+    model.rename_mode(1, "left door")
+    with th.no_grad():
+        model.critics.biases[-1][2] = math.nan
+    with pytest.raises(DivergedError) as caught:
+        model.train(1, 32)
+    named, other = "the loss of the critics of 'left door' is nan", repr(model.modes[0].name)
+    assert named in str(caught.value) and f"loss of the critics of {other}" not in str(caught.value)
+
+
+def test_the_replay_buffer_gets_no_target_action_that_is_no_number(monkeypatch):
+    model = trained(DDiffPG)
+    before = model.replay_buffer.target_actions.copy()
+    monkeypatch.setitem(model.graphs, "ascent", lambda batch: batch.target_actions * math.nan)
+    with pytest.raises(DivergedError, match="a target action is nan"):
+        model.train(1, 32)
+    np.testing.assert_array_equal(model.replay_buffer.target_actions, before)
+
+
+def test_novelty_that_is_no_number_does_not_reach_its_running_scale(monkeypatch):
+    model = trained(DDiffPG, novelty="rnd")
+    before = {name: tensor.clone() for name, tensor in model.intrinsic_moments.state_dict().items()}
+    weights = [parameter.detach().clone() for parameter in model.novelty_model.parameters()]
+    with monkeypatch.context() as broken:
+        broken.setattr(model.novelty_model, "novelty", lambda positions, _: positions[:, 0] * math.nan)
+        with pytest.raises(DivergedError, match="the novelty is nan"):
+            model.train(1, 32)
+    assert all(th.equal(tensor, before[name]) for name, tensor in model.intrinsic_moments.state_dict().items())
+    assert all(th.equal(now, then) for now, then in zip(model.novelty_model.parameters(), weights, strict=True))
+
+
+@pytest.mark.parametrize("optimizer", [th.optim.Adam, th.optim.AdamW, th.optim.SGD, th.optim.RMSprop])
+@pytest.mark.parametrize("fused", [True, False])
+def test_a_step_that_must_not_be_is_none(optimizer, fused):
+    if fused and optimizer is th.optim.RMSprop:
+        pytest.skip("has no fused version")
+    parameters = [nn.Parameter(th.ones(3)) for _ in range(2)]
+    learner, plain = (optimizer([each], lr=0.1, **({"fused": True} if fused else {})) for each in parameters)
+    for bad, gradient in ((False, 1.0), (True, math.nan), (False, 2.0)):
+        for parameter in parameters:
+            parameter.grad = th.full((3,), gradient)
+        step_unless(th.tensor(bad), learner)
+        if not bad:
+            plain.step()
+    assert th.equal(*parameters) and not th.equal(parameters[0], th.ones(3))
+    for mine, other in zip(learner.state_dict()["state"].values(), plain.state_dict()["state"].values(), strict=True):
+        assert all(th.equal(mine[key], other[key]) for key in other if other[key] is not None)
+
+
+def test_an_accelerator_is_not_waited_for_and_reports_later():
+    watch = DivergenceWatch(th.device("cuda"), largest_loss=10.0)  # nothing is computed there
+    parameter = nn.Parameter(th.ones(2))
+    optimizer = th.optim.Adam([parameter], fused=True)
+    for loss, moved in ((1.0, True), (11.0, False), (math.nan, False)):
+        parameter.grad, before = th.ones(2), parameter.detach().clone()
+        watch.step("actor", optimizer, th.tensor(loss))
+        assert th.equal(parameter, before) != moved
+    values = watch.finite("the novelty", th.tensor([1.0, math.inf, math.nan]), 0.0)
+    assert values.tolist() == [1.0, 0.0, 0.0]
+    with pytest.raises(DivergedError, match=r"the loss of the actor is nan; the novelty is nan"):
+        watch.report()
+    watch.report()  # said once
+    watch.step("actor", optimizer, th.tensor(11.0), bounded=False)
+    watch.report()
