@@ -558,18 +558,19 @@ class NoveltyActorCritic(SavableAlgorithm):
         """All environments have been reset."""
 
     def _check_buffer(self, env: VecEnv) -> None:
-        """The episodes in progress must fit, or hours later there would be nothing to evict."""
+        """Claim its memory. The episodes in progress must fit, or hours later there would be nothing to evict."""
         if self.replay_buffer.n_envs != self.n_envs:
             raise ValueError(f"The replay buffer was made for {self.replay_buffer.n_envs} environment(s), got {self.n_envs}")
         try:
             limit = getattr(env.get_attr("spec", indices=0)[0], "max_episode_steps", None)
         except AttributeError:
-            return
+            limit = None
         if limit is not None and self.replay_buffer.buffer_size < limit * self.n_envs:
             raise ValueError(
                 f"buffer_size={self.replay_buffer.buffer_size} is smaller than one episode of every environment: "
                 f"{self.n_envs} x {limit} steps"
             )
+        self.replay_buffer.allocate()
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         """

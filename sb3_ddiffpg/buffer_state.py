@@ -75,7 +75,7 @@ def buffer_state(buffer: ModeReplayBuffer) -> dict[str, Any] | None:
     :param buffer: A replay buffer
     :return: What it holds; None while that is nothing
     """
-    if not buffer._allocated:
+    if not buffer.pos:
         return None
     groups = [(key, list(group)) for key, group in buffer._groups.items()]
     trajectories = [each for _, group in groups for each in group] + list(buffer._retired)
@@ -135,7 +135,7 @@ def restore_buffer(buffer: ModeReplayBuffer, tree: Any) -> None:
     _check(buffer, state, trajectories)
 
     buffer.reset()
-    buffer._allocate()
+    buffer.allocate()
     for part, raw in zip(buffer._stored(), state.parts, strict=True):
         part.restore(raw)
     buffer.pos, buffer.full = len(state.parts[0]), state.full

@@ -229,9 +229,10 @@ class RunCheckpointCallback(BaseCallback):
     Writes the whole run to a file from time to time: networks, optimisers, replay buffer, modes, environments in the middle of
     their episodes, and random states. ``DDiffPG.resume(folder, env)`` goes on from it.
 
-    A file is complete or it is not there, and holds its own checksum. When one cannot be written (a full disk), a warning says
-    so, the ones before stay, and training goes on. SIGINT and SIGTERM write one more and end ``learn`` as if its steps were
-    done; a second SIGINT interrupts at once.
+    A file is complete or it is not there, and holds its own checksum. The first is written before the first step: what cannot
+    be saved ends the training there. When a later one cannot be written (a full disk), a warning says so, the ones before
+    stay, and training goes on. SIGINT and SIGTERM write one more and end ``learn`` as if its steps were done; a second SIGINT
+    interrupts at once.
 
     :param folder: Where the files ``checkpoint_<environment steps>.safetensors`` go
     :param save_freq: Environment steps between two of them
@@ -250,12 +251,13 @@ class RunCheckpointCallback(BaseCallback):
         self._last = 0
         self._signal: int | None = None
         self._stopped = False
+        self._first = True
 
     def _on_training_start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         remove_unfinished(self.folder, NAMES)
         _refuse_another_run(self.folder, self.model.run_id)  # type: ignore[attr-defined]
-        self._last, self._signal, self._stopped = self.model.num_timesteps, None, False
+        self._last, self._signal, self._stopped, self._first = self.model.num_timesteps, None, False, True
         self.all_callbacks = self.locals.get("callback", self)
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
@@ -269,6 +271,9 @@ class RunCheckpointCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         # Here everything that belongs to the steps so far has been done
+        if self._first and not checkpoint_files(self.folder):
+            write_checkpoint(self._path(), self.model, self.all_callbacks)  # what cannot be saved ends it now, not in hours
+        self._first = False
         due = self.num_timesteps // self.save_freq > self._last // self.save_freq
         if due or self._signal is not None:
             self.save()
@@ -282,18 +287,22 @@ class RunCheckpointCallback(BaseCallback):
         if not self._stopped and self.num_timesteps > self._last:
             self.save()
 
+    def _path(self) -> Path:
+        return self.folder / f"checkpoint_{getattr(self.model, 'lifetime_steps', self.num_timesteps):012d}.safetensors"
+
     def save(self) -> bool:
         """
         Write a checkpoint now.
 
         :return: Whether it could be written
         """
-        path = self.folder / f"checkpoint_{getattr(self.model, 'lifetime_steps', self.num_timesteps):012d}.safetensors"
+        path = self._path()
         try:
             write_checkpoint(path, self.model, self.all_callbacks)
-        except OSError as error:
+        except Exception as error:  # a full disk, or what environments or callbacks have come to hold: not worth the run
             after = "training goes on" if self._signal is None else "training ends without it"
-            warnings.warn(f"No checkpoint at step {self.num_timesteps}: {error}. The ones before stay, {after}")
+            what = error if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+            warnings.warn(f"No checkpoint at step {self.num_timesteps}: {what}. The ones before stay, {after}")
             return False
         # By age: an older run may have come further
         others = sorted(

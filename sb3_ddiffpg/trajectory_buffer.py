@@ -16,6 +16,9 @@ from sb3_ddiffpg.features import Observation
 from sb3_ddiffpg.row_storage import Fields, HostRows, make_rows
 from sb3_ddiffpg.trajectories import NO_MODE, RowSet, SuccessRule, Trajectory
 
+# Rows are numbered in 32 bits
+MOST_ROWS = 2**31 - 1
+
 
 class TrajectoryReplayBuffer(ReplayBuffer):
     """
@@ -35,7 +38,7 @@ class TrajectoryReplayBuffer(ReplayBuffer):
     :param success_key: Key of ``info`` that marks a success; None reads ``is_success`` or ``success`` and, where neither
         exists, counts the trajectories whose return is in the top fifth of those seen lately
     :param storage_device: Where observations and actions live: ``"cpu"``, or ``"auto"``: where the samples go
-    :raises ValueError: If ``buffer_size`` is not positive or ``optimize_memory_usage`` is asked for
+    :raises ValueError: If ``buffer_size`` is out of its range or ``optimize_memory_usage`` is asked for
     """
 
     # Views of the storage: arrays (tensors where it is on an accelerator), or dicts of such
@@ -61,8 +64,8 @@ class TrajectoryReplayBuffer(ReplayBuffer):
     ) -> None:
         if optimize_memory_usage:
             raise ValueError("optimize_memory_usage=True is not supported: trajectories do not lie in one ring")
-        if buffer_size < 1:
-            raise ValueError(f"buffer_size must be at least 1, got {buffer_size}")
+        if not 1 <= buffer_size <= MOST_ROWS:
+            raise ValueError(f"buffer_size must be from 1 to {MOST_ROWS}, got {buffer_size}")
         # Not ReplayBuffer's constructor: it would allocate a ring per environment
         super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
         self.optimize_memory_usage = False
@@ -137,6 +140,19 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         :return: Fields of the three parts of a row: step, next observation, notes
         """
         return self._step_fields(), self._observation_fields("next_observations"), self._note_fields()
+
+    def allocate(self) -> None:
+        """
+        Claim the memory, where that has not been done. The system grants most of it only when rows are written.
+
+        :raises ValueError: If there is not that much
+        """
+        if self._allocated:
+            return
+        try:
+            self._allocate()
+        except (MemoryError, th.OutOfMemoryError) as error:
+            raise ValueError(f"buffer_size={self.buffer_size}: there is not so much memory ({error})") from error
 
     def _allocate(self) -> None:
         steps, nexts, notes = self.part_fields()
@@ -265,8 +281,7 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         :param infos: One dict per environment
         :raises ValueError: If a value is not finite (nothing is stored then), or the buffer cannot hold one episode
         """
-        if not self._allocated:
-            self._allocate()
+        self.allocate()
         action = np.asarray(action, dtype=np.float32).reshape(self.n_envs, self.action_dim)
         for name, value in (("observation", obs), ("next observation", next_obs), ("action", action), ("reward", reward)):
             self.check_finite(name, value)

@@ -13,6 +13,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 
 from sb3_ddiffpg import ClusteringCallback, DDiffPG
+from sb3_ddiffpg.divergence import DivergedError
 from sb3_ddiffpg.episodes import run_episodes
 
 NUMBERS_FROM_ONE = (
@@ -153,6 +154,12 @@ def test_a_buffer_too_small_for_the_episodes(tmp_path):
         model.learn(10)
     small_model(DummyVecEnv([limited] * 3), buffer_size=900).learn(10)
     # Where the length of an episode is not known, once it is noticed
+    # Before the first step, not at it
+    wide = DummyVecEnv([lambda: AnySpaces(spaces.Box(-1, 1, (100_000,)))])
+    with pytest.raises(ValueError, match="buffer_size=2000000000: there is not so much memory"):
+        small_model(wide, buffer_size=2_000_000_000).learn(0)
+    with pytest.raises(ValueError, match="buffer_size must be from 1 to 2147483647, got 3000000000"):
+        small_model(wide, buffer_size=3_000_000_000)
     endless = small_model(DummyVecEnv([lambda: AnySpaces(limit=10**9)] * 2), buffer_size=30, learning_starts=100)
     with pytest.raises(ValueError, match=r"buffer_size=30 transitions is too small: .* 2 environment\(s\)"):
         endless.learn(100)
@@ -230,6 +237,10 @@ def test_optimizer_arguments_that_exclude_the_fused_one():
 def test_a_diverged_policy_does_not_step_the_environments():
     """``BreaksAt`` refuses an action of NaN, as a simulator would crash of it."""
     model = small_model(breaking("observation", 10**9), learning_rate=1e6)
+    with pytest.raises(DivergedError, match="the loss of the exploratory critics is"):
+        model.learn(1000)
+    with th.no_grad():
+        next(model.actor.diffusion.parameters()).fill_(np.nan)
     with pytest.raises(ValueError, match=r"The policy's action \(has training diverged\?\) of environment 0 is not finite"):
         model.learn(1000)
 

@@ -85,12 +85,12 @@ def assert_goes_on_the_same(make_env, folder, end=END, at=None, algorithm=DDiffP
     whole.learn(end, callback=RunCheckpointCallback(folder, save_freq=end // 8, keep=100))
     expected, state = outcome(whole), state_of(whole)
     files = checkpoint_files(folder)[::-1]
-    assert len(files) == 8
-    for path in files[:-1] if at is None else [files[i] for i in at]:
+    assert len(files) == 9
+    for path in files[:-1] if at is None else [files[i + 1] for i in at]:
         np.random.seed(99)
         th.manual_seed(99)
         model = silent(algorithm.resume(path, make_env()))
-        assert 0 < model.num_timesteps < end
+        assert model.num_timesteps < end
         model.learn(end)
         assert outcome(model) == expected
         assert_same_state(state_of(model), state)
@@ -190,6 +190,39 @@ def test_a_full_disk(tmp_path, monkeypatch):
     assert model.num_timesteps >= 240 and list(tmp_path.iterdir()) == [kept]
     monkeypatch.undo()
     assert DDiffPG.resume(tmp_path, known_ends()).num_timesteps == steps
+
+
+class HoldsAnything(TwoEnds):
+    """Its state can be saved for so many steps."""
+
+    def __init__(self, n_steps):
+        super().__init__()
+        self.left = n_steps
+
+    def step(self, action):
+        self.left -= 1
+        return super().step(action)
+
+    def state_dict(self):
+        return {"left": object() if self.left <= 0 else self.left}
+
+    def load_state_dict(self, state):
+        self.left = state["left"]
+
+
+def test_what_cannot_be_saved_is_said_before_the_first_step(tmp_path):
+    model = model_for(DummyVecEnv([lambda: HoldsAnything(0)]))
+    with pytest.raises(TypeError, match="left: <object object .* cannot be saved"):
+        model.learn(100, callback=RunCheckpointCallback(tmp_path))
+    assert model.num_timesteps == 0 and not checkpoint_files(tmp_path)
+
+
+def test_what_cannot_be_saved_later_does_not_end_the_training(tmp_path):
+    model = model_for(DummyVecEnv([lambda: HoldsAnything(150)]))
+    with pytest.warns(UserWarning, match="No checkpoint at step 200: .*left.*The ones before stay, training goes on"):
+        model.learn(300, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+    assert model.num_timesteps >= 300
+    assert [int(each.stem.split("_")[1]) for each in checkpoint_files(tmp_path)] == [100, 0]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
