@@ -1,5 +1,7 @@
 """Environments in worker processes: as in one process, and what happens when one breaks."""
 
+import math
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -26,6 +28,9 @@ class Fragile(TwoEnds):
 
     def die(self):
         os._exit(3)
+
+    def hang(self, seconds):
+        time.sleep(seconds)
 
 
 @pytest.fixture
@@ -99,6 +104,56 @@ def test_a_dead_worker_is_reported_and_does_not_hang(fragile, cause):
     assert time.perf_counter() - started < 20 and not any(process.is_alive() for process in fragile.processes)
 
 
+class HangsAt(TwoEnds):
+    """Never comes back from the given call."""
+
+    def __init__(self, call=None):
+        super().__init__()
+        self.call = call
+        self._wait("make")
+
+    def _wait(self, call):
+        if call == self.call:
+            time.sleep(1000)
+
+    def reset(self, **kwargs):
+        self._wait("reset")
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        self._wait("step")
+        return super().step(action)
+
+    def state_dict(self):
+        self._wait("state_dict")
+        return {}
+
+
+@pytest.mark.parametrize("call", [pytest.param("make", marks=pytest.mark.slow), "reset", "step", "state_dict"])
+def test_an_environment_that_hangs_is_named(call):
+    before = set(multiprocessing.active_children())
+    make = [TwoEnds, TwoEnds, TwoEnds, TwoEnds, lambda: HangsAt(call), TwoEnds]
+
+    def run():
+        env = WorkerVecEnv(make, n_workers=2, timeout=60.0)  # to begin takes a while
+        env.timeout = 2.0
+        env.reset()
+        env.step(np.zeros((6, 1), dtype=np.float32))
+        env.state_dict()
+
+    with pytest.raises(RuntimeError, match=rf"Environment 4 has hung: no answer for {60 if call == 'make' else 2} seconds"):
+        run()
+    assert set(multiprocessing.active_children()) <= before
+
+
+def test_a_slow_environment_is_waited_for(fragile):
+    fragile.timeout = 10.0
+    fragile.env_method("hang", 2.5, indices=[3])
+    fragile.timeout = 1.5
+    with pytest.raises(RuntimeError, match=r"Environment 3 has hung: no answer for 1.5 seconds"):
+        fragile.env_method("hang", 20, indices=[3])
+
+
 def test_what_an_environment_lacks_does_no_harm(fragile):
     with pytest.raises(AttributeError, match=r"(?s)Environment 1 raised an error.*no_such_thing"):
         fragile.get_attr("no_such_thing", indices=[1, 3])
@@ -160,6 +215,9 @@ def test_training_in_workers():
 def test_bad_arguments():
     with pytest.raises(ValueError, match="n_workers: 0"):
         WorkerVecEnv([TwoEnds], n_workers=0)
+    for timeout in (0, -1.0, math.nan):
+        with pytest.raises(ValueError, match=f"timeout: {timeout} given"):
+            WorkerVecEnv([TwoEnds], timeout=timeout)
 
 
 def test_an_arm_under_a_users_own_id():

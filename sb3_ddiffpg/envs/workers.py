@@ -1,10 +1,11 @@
 """Environments in a few worker processes, several in each, for simulators that step one environment at a time."""
 
+import math
 import multiprocessing
 import os
 import signal
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any, NoReturn
@@ -26,13 +27,26 @@ def n_processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _failing_env(error: BaseException) -> int:
-    """Which environment of a DummyVecEnv was at work when an error was raised; 0 if that cannot be told."""
-    frames = [frame.f_locals for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return next((int(variables["env_idx"]) for variables in frames if "env_idx" in variables), 0)
+# Before the first environment's turn
+_NOBODY = -1
 
 
-def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper) -> None:
+class _Turns(list):
+    """Environments of a worker. Whose turn it was last can be seen by the parent, even if it never comes back."""
+
+    def __init__(self, envs: Sequence[gym.Env], turn: Any) -> None:
+        super().__init__(envs)
+        self.turn = turn
+
+    def __getitem__(self, index: Any) -> Any:
+        self.turn.value = index
+        return super().__getitem__(index)
+
+    def __iter__(self) -> Iterator[gym.Env]:
+        return (self[index] for index in range(len(self)))
+
+
+def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper, turn: Any) -> None:
     """What a worker does: it answers each command with ``("ok", result)`` or ``("error", (environment, error, text))``."""
     parent.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent says what happens now
@@ -44,7 +58,7 @@ def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper) -
             break  # the parent is gone
         try:
             if command == "make":
-                envs = _make(wrapped.var)
+                envs = _make(wrapped.var, turn)
                 result: Any = (envs.observation_space, envs.action_space, envs.render_mode)
             elif command == "close":
                 break
@@ -52,17 +66,20 @@ def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper) -
                 result = _answer(envs, command, argument)
             remote.send(("ok", result))
         except Exception as error:
-            remote.send(("error", (_failing_env(error), type(error), traceback.format_exc())))
+            remote.send(("error", (turn.value, type(error), traceback.format_exc())))
     if envs is not None:
         envs.close()
     remote.close()
 
 
-def _make(env_fns: Sequence[Callable[[], gym.Env]]) -> DummyVecEnv:
+def _make(env_fns: Sequence[Callable[[], gym.Env]], turn: Any) -> DummyVecEnv:
     made = []
-    for env_idx, make in enumerate(env_fns):  # noqa: B007 - the name by which a failing one is found
+    for env_idx, make in enumerate(env_fns):
+        turn.value = env_idx
         made.append(make())
-    return DummyVecEnv([partial(made.__getitem__, i) for i in range(len(made))])
+    envs = DummyVecEnv([partial(made.__getitem__, i) for i in range(len(made))])
+    envs.envs = _Turns(made, turn)
+    return envs
 
 
 def _answer(envs: Any, command: str, argument: Any) -> Any:
@@ -92,18 +109,25 @@ class WorkerVecEnv(VecEnv):
     SB3's ``SubprocVecEnv`` with several environments in each process: one process for each of many environments costs more
     memory than the environments, and time to tell each its action.
 
-    An environment that raises, and a worker that dies, end the run with an error that names the environment and the cause.
+    An environment that raises or hangs, and a worker that dies, end the run with an error that names the environment and the
+    cause.
 
     :param env_fns: functions that make the environments
     :param n_workers: number of processes; None: one per processor that this process may use
-    :raises ValueError: if ``n_workers`` is less than 1
+    :param timeout: seconds for which the environments of a worker may be at work on one answer; None: for ever
+    :raises ValueError: if ``n_workers`` is less than 1, or ``timeout`` is not positive
     """
 
-    def __init__(self, env_fns: Sequence[Callable[[], gym.Env]], n_workers: int | None = None) -> None:
+    def __init__(
+        self, env_fns: Sequence[Callable[[], gym.Env]], n_workers: int | None = None, timeout: float | None = 300.0
+    ) -> None:
         if n_workers is None:
             n_workers = n_processors()
         if n_workers < 1:
             raise ValueError(f"n_workers: {n_workers} given; accepted are whole numbers from 1 up")
+        if timeout is not None and not timeout > 0:
+            raise ValueError(f"timeout: {timeout} given; accepted are numbers above 0, and None")
+        self.timeout = math.inf if timeout is None else timeout
         n_workers = min(n_workers, len(env_fns))
         #: First environment of each worker, and the number of environments
         self.first = np.linspace(0, len(env_fns), n_workers + 1).round().astype(int)
@@ -112,14 +136,17 @@ class WorkerVecEnv(VecEnv):
         context: Any = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
         self.remotes: list[Connection] = []
         self.processes: list[Any] = []
+        self._turns: list[Any] = []
         self._closed = self._made = False
         for first, last in zip(self.first[:-1], self.first[1:], strict=True):
             remote, theirs = context.Pipe()
+            turn = context.RawValue("i", _NOBODY)
             # A daemon, so that it does not outlive a crash of this process
             process = context.Process(
-                target=_work, args=(theirs, remote, CloudpickleWrapper(list(env_fns[first:last]))), daemon=True
+                target=_work, args=(theirs, remote, CloudpickleWrapper(list(env_fns[first:last])), turn), daemon=True
             )
             process.start()
+            self._turns.append(turn)
             theirs.close()
             self.remotes.append(remote)
             self.processes.append(process)
@@ -161,7 +188,12 @@ class WorkerVecEnv(VecEnv):
 
     def _hear_one(self, worker: int) -> tuple[str, Any]:
         remote = self.remotes[worker]
-        wait([remote, self.processes[worker].sentinel])
+        left = self.timeout
+        # In slices: while all processes are stopped (Ctrl-Z), the clock goes on
+        while not wait([remote, self.processes[worker].sentinel], min(left, 1.0)):
+            left -= 1.0
+            if left <= 0:
+                self._give_up(worker)
         try:
             # An answer may still lie in the pipe of a worker that has ended since
             if remote.poll():
@@ -172,6 +204,13 @@ class WorkerVecEnv(VecEnv):
         except (EOFError, ConnectionResetError):
             pass
         return self._fail(worker)
+
+    def _give_up(self, worker: int) -> NoReturn:
+        turn, first, last = self._turns[worker].value, self.first[worker], self.first[worker + 1] - 1
+        who = f"The worker process with environments {first} to {last}" if turn == _NOBODY else f"Environment {first + turn}"
+        self.processes[worker].kill()  # it would not hear that it is to close
+        self.close()
+        raise RuntimeError(f"{who} has hung: no answer for {self.timeout:g} seconds (timeout of WorkerVecEnv)")
 
     def _fail(self, worker: int) -> NoReturn:
         process = self.processes[worker]
