@@ -3,7 +3,7 @@ PYTHON := $(shell python3.11 -c "print('python3.11')" 2>/dev/null || echo python
 BIN := .venv/bin
 DEPENDENCIES := setup.cfg pyproject.toml constraints.txt
 
-.PHONY: demo test fast slow gpu lint type format bench clean
+.PHONY: demo test fast slow gpu fuzz lint type format bench clean
 
 demo: .venv/.installed
 	$(BIN)/python examples/demo.py
@@ -20,6 +20,13 @@ slow: .venv/.installed-dev
 # the tests use the CPU unless they are told otherwise
 gpu: .venv/.installed-dev
 	CUDA_VISIBLE_DEVICES=0 CUBLAS_WORKSPACE_CONFIG=:4096:8 $(BIN)/python -m pytest tests/test_accelerator.py
+
+# an input that fails is left in crash-*; SECONDS for each test
+SECONDS ?= 3600
+fuzz: .venv/.installed-dev
+	$(BIN)/pip install --quiet -e ".[fuzz]"
+	for test in $$(sed -n 's/^def test_\(\w*\).*/\1/p' tests/test_hostile_input.py); do \
+		OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz.py $$test -max_total_time=$(SECONDS) || exit 1; done
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff check .

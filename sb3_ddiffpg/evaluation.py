@@ -20,6 +20,7 @@ from sb3_ddiffpg.dtw import dtw_distances, erase_loops, resample_path
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.episodes import EpisodeResult, run_episodes
 from sb3_ddiffpg.rng import preserved_rng
+from sb3_ddiffpg.safe_files import convert
 from sb3_ddiffpg.trajectories import NO_MODE
 
 #: Share of episodes from which on a way counts as one that the model robustly takes
@@ -250,18 +251,20 @@ class ModeEvaluation:
         if not isinstance(data, dict) or data.get("format") != _FORMAT:
             raise ValueError(f"it is not of format {_FORMAT}")
 
-        def command(row: dict[str, Any]) -> CommandResult:
-            return CommandResult(**{**row, "mean_length": _nan(row["mean_length"]), "mean_return": _nan(row["mean_return"])})
+        def command(row: dict[str, Any]) -> dict[str, Any]:
+            return {**row, "mean_length": _nan(row["mean_length"]), "mean_return": _nan(row["mean_return"])}
 
-        return ModeEvaluation(
-            env_id=data["env_id"],
-            label_source=data["label_source"],
-            listed=tuple(data["listed"]),
-            start_spread=data["start_spread"],
-            uncommanded=command(data["uncommanded"]),
-            commanded=tuple(command(row) for row in data["commanded"]),
-            ways=tuple(WayResult(**row) for row in data["ways"]),
-        )
+        counted = {name: value for name, value in data.items() if name not in ("format", "summary", "episodes")}
+        counted["uncommanded"] = command(data["uncommanded"])
+        counted["commanded"] = [command(row) for row in data["commanded"]]
+        found = convert(counted, ModeEvaluation, "evaluation")
+        for each in (found.uncommanded, *found.commanded):
+            counts = each.labels.values()
+            if not (each.n_episodes > 0 and all(count > 0 for count in counts) and sum(counts) <= each.n_successes):
+                raise ValueError(f"{_command_name(each.mode)}: the numbers of episodes contradict each other")
+            if each.n_successes > each.n_episodes:
+                raise ValueError(f"{_command_name(each.mode)}: more successes than episodes")
+        return found
 
 
 def _command_name(mode: str | None) -> str:

@@ -114,6 +114,8 @@ def _read_map(maze_map: MazeMap) -> tuple[str, ...]:
         if maze_map not in MAZES:
             raise ValueError(f"maze_map: {maze_map!r} is no known maze; give one of {', '.join(MAZES)} or a list of rows")
         maze_map = MAZES[maze_map]
+    if not all(isinstance(row, str | Sequence | np.ndarray) and np.ndim(row) <= 1 for row in maze_map):
+        raise ValueError(f"maze_map: accepted are rows of cells, got {maze_map!r}")
     for row in maze_map:
         for cell in row:
             if str(cell) not in _CELL_SYMBOLS:
