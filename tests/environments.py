@@ -167,3 +167,14 @@ def assert_no_gaps(buffer: ModeReplayBuffer) -> None:
         np.testing.assert_array_equal(buffer.observations[rows[1:]], buffer.next_observations[rows[:-1]])
         assert buffer.observations[rows[0], 1] == 0.0  # the time within the episode
     assert all(buffer.dones[rows[-1]] and not buffer.dones[rows[:-1]].any() for rows in finished)
+
+
+def copied(node: Any) -> Any:
+    """A tree as a file holds it, in lists and dicts that may be changed."""
+    if isinstance(node, dict):
+        return {key: copied(each) for key, each in node.items()}
+    if isinstance(node, (list, tuple)):
+        return [copied(each) for each in node]
+    if isinstance(node, th.Tensor):
+        node = node.detach().numpy()
+    return node.copy() if isinstance(node, np.ndarray) else node

@@ -11,7 +11,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import yaml
-from environments import TwoEnds, small_model
+from environments import TwoEnds, copied, small_model
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -45,15 +45,6 @@ def trained() -> DDiffPG:
 def exported() -> bytes:
     trained().export(folder() / "good")
     return (folder() / "good").read_bytes()
-
-
-def copied(node):
-    """A tree as a file holds it, in lists and dicts that may be changed."""
-    if isinstance(node, dict):
-        return {key: copied(each) for key, each in node.items()}
-    if isinstance(node, (list, tuple)):
-        return [copied(each) for each in node]
-    return node.detach().numpy().copy() if hasattr(node, "detach") else node.copy() if isinstance(node, np.ndarray) else node
 
 
 def mutate(tree, data):

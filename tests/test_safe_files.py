@@ -6,8 +6,16 @@ import zipfile
 
 import numpy as np
 import pytest
-import torch as th
-from environments import AnySpaces, TwoEnds, assert_same_state, image_dict_space, small_model, some_observations, state_of
+from environments import (
+    AnySpaces,
+    TwoEnds,
+    assert_same_state,
+    copied,
+    image_dict_space,
+    small_model,
+    some_observations,
+    state_of,
+)
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -72,15 +80,6 @@ def test_one_changed_byte_is_found(tmp_path_factory, data):
     raw[place] ^= data.draw(st.integers(1, 255))
     path.write_bytes(raw)
     with pytest.raises(ValueError, match="file"):
-        read(path, "thing")
-
-
-@given(raw=st.binary(max_size=200))
-@settings(max_examples=100, deadline=None)
-def test_any_bytes(tmp_path_factory, raw):
-    path = tmp_path_factory.mktemp("tree") / "file"
-    path.write_bytes(raw)
-    with pytest.raises(ValueError, match="damaged"):
         read(path, "thing")
 
 
@@ -269,61 +268,13 @@ def test_plain_arguments(value):
     assert from_plain(to_plain(value)) == value
 
 
-def mutate(tree, data):
-    """Put something else into a random place of a tree."""
-    places = []
-
-    def walk(node):
-        entries = list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else []
-        for key in entries:
-            places.append((node, key))
-            walk(node[key])
-
-    walk(tree)
-    node, key = places[data.draw(st.integers(0, len(places) - 1))]
-    before = node[key]
-    other = st.sampled_from([None, True, -1, 0, 10**12, 2**70, float("nan"), 1e300, "", "x", [], {}, np.zeros(3, np.float32)])
-    if isinstance(before, np.ndarray) and before.size:
-        other |= st.sampled_from(
-            [before.ravel()[:0], before.astype(np.float64), before[None], before * 0 - 1, np.full_like(before, 1)]
-        )
-    new = data.draw(other)
-    if data.draw(st.booleans()) and isinstance(node, dict):
-        node.pop(key)
-    else:
-        node[key] = new
-
-
 def test_an_array_where_a_mapping_belongs():
     with pytest.raises(ValueError, match="it: Expected `object`"):
         convert(np.zeros(3), dict[str, int], "it")
 
 
-@given(data=st.data())
-@settings(max_examples=60, deadline=None)
-def test_a_changed_model_is_a_model_or_a_clear_error(trained, data):
-    tree = read_back(trained)
-    mutate(tree, data)
-    try:
-        model = build_model(DDiffPG, tree)
-    except ValueError as error:
-        assert str(error)
-        return
-    model.predict(np.zeros((2, 2), dtype=np.float32))
-
-
 def read_back(model):
-    """As a file holds it, in lists and dicts that may be changed."""
-    tree = model_tree(model)
-
-    def copy(node):
-        if isinstance(node, dict):
-            return {key: copy(each) for key, each in node.items()}
-        if isinstance(node, (list, tuple)):
-            return [copy(each) for each in node]
-        return node.detach().numpy().copy() if isinstance(node, th.Tensor) else node
-
-    return copy(tree)
+    return copied(model_tree(model))
 
 
 def test_names_with_slashes_are_not_mixed_up(tmp_path):
