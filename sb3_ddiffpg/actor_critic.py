@@ -32,8 +32,6 @@ from sb3_ddiffpg.visits import VisitMap
 
 SelfActorCritic = TypeVar("SelfActorCritic", bound="NoveltyActorCritic")
 
-# Where a normalised intrinsic reward is cut, in standard deviations
-LARGEST_INTRINSIC = 10.0
 # Metric: share of the first group's targets at the upper end of the support; and how much of it is a fault
 CUT_VALUES, MOST_CUT_VALUES = "values_at_limit", 0.02
 
@@ -74,6 +72,7 @@ class NoveltyActorCritic(SavableAlgorithm):
     :param novelty_scale: The factor alpha of NovelD
     :param intrinsic_coef: Factor c on the intrinsic reward
     :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation
+    :param intrinsic_clip: What one place is worth at most, in these deviations: a low limit hides a rare place behind others
     :param episodic_novelty: Whether a place pays only when it is reached for the first time in an episode (Zhang et al., 2021,
         section 3): otherwise explorers stand where fewest have been
     :param max_grad_norm: Largest gradient norm of the actor and of each group's critics
@@ -127,6 +126,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         novelty_scale: float = 0.5,
         intrinsic_coef: float = 0.05,
         normalize_intrinsic: bool = True,
+        intrinsic_clip: float = 10.0,
         episodic_novelty: bool = True,
         max_grad_norm: float = 1.0,
         stats_window_size: int = 100,
@@ -180,6 +180,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         self.novelty_scale = novelty_scale
         self.intrinsic_coef = intrinsic_coef
         self.normalize_intrinsic = normalize_intrinsic
+        self.intrinsic_clip = intrinsic_clip
         self.episodic_novelty = episodic_novelty
         self.max_grad_norm = max_grad_norm
 
@@ -348,14 +349,14 @@ class NoveltyActorCritic(SavableAlgorithm):
             # Not centred: where nothing is new, a negative reward would make it worth while to end the episode at a goal.
             # Limited: one surprising state would dominate the values for long
             scale = self.intrinsic_moments.var.sqrt() + 1e-8
-            reward = (reward / scale).clamp(max=LARGEST_INTRINSIC)
+            reward = (reward / scale).clamp(max=self.intrinsic_clip)
         if self.novelty_model.optimizer is not None:
             metrics["novelty_loss"].append(self.novelty_model.update(*inputs[1]))
         places = th.from_numpy(np.flatnonzero(present)).to(self.device, non_blocking=True)
         rewards = reward.new_zeros(windows.size).index_copy(0, places, reward).view(windows.shape)
         if self.normalize_intrinsic and len(windows) > 1:
             # For a mode an ordinary place is worth nothing: staying there for ever would be worth as much as a distant goal
-            ordinary = (self.intrinsic_moments.mean / scale).clamp(max=LARGEST_INTRINSIC)
+            ordinary = (self.intrinsic_moments.mean / scale).clamp(max=self.intrinsic_clip)
             modes_present = th.from_numpy(present[1:]).to(self.device, non_blocking=True)
             rewards[1:] -= ordinary * modes_present
         discounts = self.gamma ** th.arange(windows.shape[-1], device=self.device)

@@ -15,7 +15,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_ddiffpg.actor_critic import LARGEST_INTRINSIC, NoveltyActorCritic
+from sb3_ddiffpg.actor_critic import NoveltyActorCritic
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP, Behavior
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.callbacks import ClusteringCallback, contains_clustering
@@ -114,6 +114,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param new_way_coef: Factor on the environment's reward that the exploratory critics get for goals reached by ways that are
         in no mode, or in one that has not its fill of trajectories yet: a second way is worth finding where the first pays
     :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation
+    :param intrinsic_clip: What one place is worth at most, in these deviations: a low limit hides a rare place behind others
     :param episodic_novelty: Whether a place pays only when it is reached for the first time in an episode (Zhang et al., 2021,
         section 3): otherwise explorers stand where fewest have been
     :param explore_off_modes: Whether explorers are paid nothing for places where the trajectories of the modes go that reach
@@ -203,6 +204,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         mode_intrinsic_coef: float = 0.0,
         new_way_coef: float = 0.0,
         normalize_intrinsic: bool = True,
+        intrinsic_clip: float = 10.0,
         episodic_novelty: bool = True,
         explore_off_modes: bool = True,
         reset_new_critics: bool = True,
@@ -248,6 +250,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             novelty_scale=novelty_scale,
             intrinsic_coef=intrinsic_coef,
             normalize_intrinsic=normalize_intrinsic,
+            intrinsic_clip=intrinsic_clip,
             episodic_novelty=episodic_novelty,
             max_grad_norm=max_grad_norm,
             stats_window_size=stats_window_size,
@@ -313,7 +316,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     def _exploration_v_max(self) -> float:
         if self.exploration_v_max is not None:
             return self.exploration_v_max
-        return max(self.v_max, LARGEST_INTRINSIC * self.intrinsic_coef / max(1 - self.gamma, 1e-4))
+        return max(self.v_max, self.intrinsic_clip * self.intrinsic_coef / max(1 - self.gamma, 1e-4))
 
     def _buffer_arguments(self) -> dict[str, Any]:
         return {

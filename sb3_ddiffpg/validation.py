@@ -52,7 +52,7 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     ),
     (("max_grad_norm",), "be positive", lambda value: _is_number(value) and value > 0),
     (
-        ("action_lr", "reward_scale"),
+        ("action_lr", "reward_scale", "intrinsic_clip"),
         "be positive and finite",
         lambda value: _is_number(value) and 0 < value < np.inf,
     ),

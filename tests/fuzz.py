@@ -24,7 +24,8 @@ def main() -> None:
         sys.exit("\n".join(["Accepted are", *TESTS]))
     name, *options = sys.argv[1:]
     warnings.simplefilter("ignore")
-    atheris.Setup([sys.argv[0], "-timeout=60", "-rss_limit_mb=4096", *options], TESTS[name].hypothesis.fuzz_one_input)
+    limits = ["-timeout=60", "-rss_limit_mb=4096", "-max_len=4096", "-len_control=0"]  # short ones make no input
+    atheris.Setup([sys.argv[0], *limits, *options], TESTS[name].hypothesis.fuzz_one_input)
     atheris.Fuzz()
 
 

@@ -32,7 +32,7 @@ BAD_ARGUMENTS = [
     *((name, np.nan) for name in ("gamma", "tau", "action_lr", "reward_scale", "v_min", "v_max", "novelty_scale")),
     *(
         (name, value)
-        for name in ("action_lr", "reward_scale", "max_grad_norm", "exploration_v_max")
+        for name in ("action_lr", "reward_scale", "max_grad_norm", "exploration_v_max", "intrinsic_clip")
         for value in (0, -1.0, "x")
     ),
     *(

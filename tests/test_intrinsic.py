@@ -384,3 +384,20 @@ def test_known_places_are_saved(tmp_path):
     model.export(tmp_path / "safe")
     for loaded in (DDiffPG.load(tmp_path / "model"), DDiffPG.load(tmp_path / "safe", safe=True)):
         assert th.equal(loaded.known_places.known, model.known_places.known)
+
+
+@pytest.mark.parametrize("clip", [2.0, 50.0])
+def test_one_place_is_worth_no_more_than_the_limit(clip):
+    model = filled_model(intrinsic_clip=clip, episodic_novelty=False, explore_off_modes=False, intrinsic_coef=0.1)
+    assert model.critics.upper[0].item() == pytest.approx(max(5.0, clip * 0.1 / (1 - model.gamma)))
+    stored = model.replay_buffer._all.rows[: model.replay_buffer.size()]
+    model.novelty_model.counts.fill_(1e6)  # all is known
+    model._intrinsic_rewards(stored[None, :, None], defaultdict(list))
+    positions = model.replay_buffer.next_observations[stored[:1], :1]
+    model.novelty_model.counts[model.novelty_model._entries(th.as_tensor(positions))] = 0.0  # but one place
+    reward = model._intrinsic_rewards(stored[None, :, None], defaultdict(list))
+    deviation = model.intrinsic_moments.var.sqrt().item()
+    novelty = model.novelty_scale * 1e-3  # NovelD: what lies beyond less alpha times what lies before
+    largest = (1.0 - novelty) / deviation
+    assert reward.max().item() == pytest.approx(0.1 * min(clip, largest), rel=1e-3)
+    assert largest > 2.0
