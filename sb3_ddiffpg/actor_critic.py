@@ -385,8 +385,8 @@ class NoveltyActorCritic(SavableAlgorithm):
             return positions, self.actor.features(obs)
 
     def _update_critics(self, batch: ModeBatch, rewards: th.Tensor, metrics: dict[str, list[th.Tensor]]) -> None:
-        losses, at_top = self.graphs["critics"](batch, rewards)
-        self.divergence_watch.step(self._critic_names(), self.policy.critics.optimizer, losses)
+        losses, norms, at_top = self.graphs["critics"](batch, rewards)
+        self.divergence_watch.step(self._critic_names(), self.policy.critics.optimizer, losses, norms)
         metrics["critic_loss"].append(losses.mean())
         metrics[CUT_VALUES].append(at_top[0])
 
@@ -394,12 +394,12 @@ class NoveltyActorCritic(SavableAlgorithm):
         """How an error calls the critics of each group."""
         return ["critics"]
 
-    def _critic_gradients(self, batch: ModeBatch, rewards: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def _critic_gradients(self, batch: ModeBatch, rewards: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
         :param batch: The batch
         :param rewards: What its transitions are worth, [G, n]
-        :return: Loss of every group and share of its targets at the upper end of its values, [G] each; the gradients, clipped,
-            are left at the critics
+        :return: Loss of every group, norm of its gradient, and share of its targets at the upper end of its values, [G] each;
+            the gradients, clipped, are left at the critics
         """
         policy, shape = self.policy, batch.actions.shape
         with th.no_grad():
@@ -414,8 +414,8 @@ class NoveltyActorCritic(SavableAlgorithm):
         losses = policy.critics.loss(policy.critic_features(batch.observations), batch.actions, targets)
         policy.critics.optimizer.zero_grad(set_to_none=True)
         (losses * batch.active).sum().backward()
-        policy.critics.clip_gradients(self.max_grad_norm)
-        return losses.detach(), policy.critics.share_at_top(targets)
+        norms = policy.critics.clip_gradients(self.max_grad_norm)
+        return losses.detach(), norms, policy.critics.share_at_top(targets)
 
     def _update_targets(self) -> None:
         policy = self.policy

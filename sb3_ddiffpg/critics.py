@@ -300,17 +300,20 @@ class ModeCritics(nn.Module):
         return [*self.weights, *self.biases]
 
     @th.no_grad()
-    def clip_gradients(self, max_norm: float) -> None:
+    def clip_gradients(self, max_norm: float) -> th.Tensor:
         """
         Clip every group's gradient on its own: one group's exploding loss must not shrink the steps of the others.
 
         :param max_norm: Largest allowed norm of one group's gradient
+        :return: What each norm was, [G]
         """
         gradients = [parameter.grad for parameter in self.stacked_parameters() if parameter.grad is not None]
         squares = th.stack([gradient.flatten(1).pow(2).sum(dim=1) for gradient in gradients])
-        scale = (max_norm / (squares.sum(dim=0).sqrt() + 1e-6)).clamp(max=1.0)  # [G]
+        norms = squares.sum(dim=0).sqrt()  # [G]
+        scale = (max_norm / (norms + 1e-6)).clamp(max=1.0)
         for gradient in gradients:
             gradient.mul_(scale[:, None, None, None])
+        return norms
 
 
 def project_distribution(probabilities: th.Tensor, atoms: th.Tensor, rewards: th.Tensor, discounts: th.Tensor) -> th.Tensor:

@@ -445,19 +445,19 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         )
 
     def _update_policy(self, batch: ModeBatch, target_actions: th.Tensor) -> th.Tensor:
-        loss = self.graphs["policy"](batch, target_actions)
-        self.divergence_watch.step("actor", self.actor.optimizer, loss)
+        loss, norm = self.graphs["policy"](batch, target_actions)
+        self.divergence_watch.step(["actor"], self.actor.optimizer, loss, norm)
         return loss
 
-    def _policy_gradients(self, batch: ModeBatch, target_actions: th.Tensor) -> th.Tensor:
-        """The denoising loss; its gradients, clipped, are left at the actor."""
+    def _policy_gradients(self, batch: ModeBatch, target_actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """The denoising loss and the norm of its gradient, which is left, clipped, at the actor."""
         condition = self.actor.condition(batch.observations, self._row_embeddings(batch, masked=True))
         weights = batch.imitated.flatten().float()
         loss = self.actor.diffusion.loss(target_actions.flatten(0, 1), condition, weights=weights)
         self.actor.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        th.nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
-        return loss.detach()
+        norm = th.nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
+        return loss.detach(), norm
 
     # ------------------------------------------------------------------ acting
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch as th
 
@@ -30,6 +31,12 @@ def step_unless(bad: th.Tensor, optimizer: th.optim.Optimizer) -> None:
         optimizer.step()
 
 
+class _Seen(NamedTuple):
+    names: list[str]
+    values: th.Tensor
+    limits: list[float]
+
+
 class DivergenceWatch:
     """
     Looks at what is about to change parameters or the buffer. On the CPU it raises at once; an accelerator, which nothing here
@@ -42,28 +49,35 @@ class DivergenceWatch:
     def __init__(self, device: th.device, largest_loss: float = math.inf) -> None:
         self.largest_loss = largest_loss
         self._at_once = device.type == "cpu"
-        self._names: list[str] = []
-        self._limits: list[float] = []
-        self._values: list[th.Tensor] = []
+        self._seen: list[_Seen] = []
 
-    def step(self, parts: str | Sequence[str], optimizer: th.optim.Optimizer, losses: th.Tensor, bounded: bool = True) -> None:
+    def step(
+        self,
+        parts: Sequence[str],
+        optimizer: th.optim.Optimizer,
+        losses: th.Tensor,
+        norms: th.Tensor,
+        bounded: bool = True,
+    ) -> None:
         """
-        One step of an optimiser, unless its loss or gradient is at fault.
+        One step of an optimiser, unless a loss or gradient is at fault.
 
-        :param parts: What learns, a name for each loss
+        :param parts: What learns, G names
         :param optimizer: With the gradients at its parameters
-        :param losses: A scalar, or several
-        :param bounded: Whether ``largest_loss`` holds for them
+        :param losses: Of each part, [G], or a scalar
+        :param norms: Of each part's gradient, [G], or a scalar
+        :param bounded: Whether ``largest_loss`` holds
         :raises DivergedError: See the class
         """
-        parts = [parts] if isinstance(parts, str) else parts
-        gradients = [each.grad for group in optimizer.param_groups for each in group["params"] if each.grad is not None]
-        values = th.cat((losses.detach().reshape(-1), th.nn.utils.get_total_norm(gradients).reshape(1)))
+        losses, norms = losses.detach(), norms.detach()
         limit = self.largest_loss if bounded else math.inf
-        names = [f"the loss of the {part}" for part in parts] + ["the gradient of the " + ", ".join(parts)]
-        self._look(names, values, [*[limit] * len(parts), math.inf])
-        bad = ~((values[:-1].abs() < limit).all() & values[-1].isfinite())
-        step_unless(bad, optimizer)
+        names = [f"the {what} of the {part}" for what in ("loss", "gradient") for part in parts]
+        limits = [*[limit] * len(parts), *[math.inf] * len(parts)]
+        self._look(names, th.cat((losses.reshape(-1), norms.reshape(-1))), limits)
+        if self._at_once:
+            optimizer.step()
+        else:
+            step_unless(~((losses.abs() < limit).all() & norms.isfinite().all()), optimizer)
 
     def finite(self, name: str, values: th.Tensor, instead: th.Tensor | float) -> th.Tensor:
         """
@@ -73,13 +87,11 @@ class DivergenceWatch:
         :return: The values
         :raises DivergedError: See the class
         """
-        self._look([name], values.detach().abs().amax().reshape(1), [math.inf])
+        self._look([name], values.detach().abs().max().reshape(1), [math.inf])
         return values if self._at_once else th.where(values.isfinite(), values, instead)
 
     def _look(self, names: list[str], values: th.Tensor, limits: list[float]) -> None:
-        self._names += names
-        self._limits += limits
-        self._values.append(values)
+        self._seen.append(_Seen(names, values, limits))
         if self._at_once:
             self.report()
 
@@ -87,11 +99,11 @@ class DivergenceWatch:
         """
         :raises DivergedError: If something was at fault since the report before, naming it
         """
-        names, limits, values = self._names, self._limits, self._values
-        self._names, self._limits, self._values = [], [], []
-        if not names:
+        seen, self._seen = self._seen, []
+        if not seen:
             return
-        given = zip(names, th.cat(values).tolist(), limits, strict=True)
+        values = iter(th.cat([each.values for each in seen]).tolist())
+        given = [(name, next(values), limit) for each in seen for name, limit in zip(each.names, each.limits, strict=True)]
         wrong = {name: f"{name} is {value:.4g}" for name, value, limit in given if not abs(value) < limit}
         if wrong:
             raise DivergedError(

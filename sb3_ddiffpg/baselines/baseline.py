@@ -107,8 +107,8 @@ class Baseline(NoveltyActorCritic):
         """One step of the actor's optimiser; gives the loss back."""
         self.actor.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        th.nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
-        self.divergence_watch.step("actor", self.actor.optimizer, loss)
+        norm = th.nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
+        self.divergence_watch.step(["actor"], self.actor.optimizer, loss, norm)
         return loss.detach()
 
     def _values(self, batch: ModeBatch, actions: th.Tensor) -> th.Tensor:

@@ -19,8 +19,9 @@ from torch import nn
 from torch.nn import functional as F
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from sb3_ddiffpg.actor_critic import CUT_VALUES, NoveltyActorCritic
+from sb3_ddiffpg.actor_critic import CUT_VALUES
 from sb3_ddiffpg.baselines.baseline import FifoReplayBuffer, names_of
+from sb3_ddiffpg.baselines.entropy_tuning import EntropyTuning
 from sb3_ddiffpg.baselines.sac_c51 import GaussianActor
 from sb3_ddiffpg.baselines.world_model import WorldModel
 from sb3_ddiffpg.safe_files import check_array, convert
@@ -284,7 +285,7 @@ class Segments:
     present: th.Tensor
 
 
-class RPG(NoveltyActorCritic):
+class RPG(EntropyTuning):
     """
     Reparameterised policy gradient (Huang et al., 2023, https://arxiv.org/abs/2307.10710): each episode draws a latent
     variable z, which the policy pi(a | s, z) sees. The policy climbs the lambda-return of its own rollouts in a learned model,
@@ -301,12 +302,12 @@ class RPG(NoveltyActorCritic):
     :param value_loss_coef: Factor of the values' squared error
     :param state_loss_coef: Factor of the latent states' squared error
     :param target_update_interval: Updates between two steps of the target model
-    :param entropy_learning_rate: Learning rate of the entropy's factor
-    :param initial_entropy_coef: Its first value
-    :param target_entropy: Entropy that it aims at; None: minus the action's size
+    :param entropy_learning_rate: As in ``EntropyTuning``
+    :param initial_entropy_coef: As there
     :param tau: As in ``NoveltyActorCritic``
     :param n_atoms: Values are scalar: only 1
-    :param kwargs: Of ``NoveltyActorCritic``; there is no Bellman target, so what is said of one has no effect
+    :param kwargs: Of ``EntropyTuning`` and ``NoveltyActorCritic``; there is no Bellman target, so what is said of one has no
+        effect
     :raises ValueError: If an argument is out of its range, naming it
     """
 
@@ -330,7 +331,6 @@ class RPG(NoveltyActorCritic):
         target_update_interval: int = 2,
         entropy_learning_rate: float = 3e-4,
         initial_entropy_coef: float = 0.01,
-        target_entropy: float | None = None,
         tau: float = 0.01,
         n_atoms: int = 1,
         **kwargs: Any,
@@ -344,31 +344,23 @@ class RPG(NoveltyActorCritic):
         self.value_loss_coef = value_loss_coef
         self.state_loss_coef = state_loss_coef
         self.target_update_interval = target_update_interval
-        self.entropy_learning_rate = entropy_learning_rate
-        self.initial_entropy_coef = initial_entropy_coef
-        self.target_entropy = target_entropy
         self._n_model_updates = 0
         self._episode_latents = np.empty((0, latent_dim), dtype=np.float32)
-        super().__init__(policy, env, n_steps=n_steps, tau=tau, n_atoms=n_atoms, **kwargs)
+        super().__init__(
+            policy,
+            env,
+            entropy_learning_rate=entropy_learning_rate,
+            initial_entropy_coef=initial_entropy_coef,
+            n_steps=n_steps,
+            tau=tau,
+            n_atoms=n_atoms,
+            **kwargs,
+        )
 
     # ------------------------------------------------------------------ set-up
 
     def _policy_arguments(self) -> dict[str, Any]:
         return {"latent_dim": self.latent_dim, "n_critics": self.n_critics, "support": (self.v_min, self.v_max)}
-
-    def _setup_model(self) -> None:
-        no_noise = self.action_noise is None
-        super()._setup_model()
-        if no_noise:
-            self.action_noise = None  # its own noise explores
-        with th.no_grad():
-            self.policy.log_entropy_coef.fill_(float(np.log(self.initial_entropy_coef)))
-        self.entropy_optimizer = th.optim.Adam([self.policy.log_entropy_coef], lr=self.entropy_learning_rate)
-
-    @property
-    def entropy_coef(self) -> th.Tensor:
-        """The factor alpha of the entropy, a scalar."""
-        return self.policy.log_entropy_coef.detach().exp()
 
     # ------------------------------------------------------------------ learning
 
@@ -459,9 +451,9 @@ class RPG(NoveltyActorCritic):
         loss = th.stack([factors[name] * mean for name, mean in means.items()]).sum()
         policy.critics.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        th.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
+        norm = th.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
         # Rewards that it predicts need not lie within the values' support
-        self.divergence_watch.step("model", policy.critics.optimizer, loss, bounded=False)
+        self.divergence_watch.step(["model"], policy.critics.optimizer, loss, norm, bounded=False)
         for name, mean in means.items():
             metrics[f"{name}_loss"].append(mean.detach())
 
@@ -476,17 +468,12 @@ class RPG(NoveltyActorCritic):
         loss = -returns.mean() - ratios.mean()
         self.actor.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        for part in (self.actor, policy.inference):
-            th.nn.utils.clip_grad_norm_(part.parameters(), self.max_grad_norm)
-        self.divergence_watch.step("actor", self.actor.optimizer, loss, bounded=False)
-        target = -float(segments.actions.shape[-1]) if self.target_entropy is None else self.target_entropy
-        entropy_loss = -(policy.log_entropy_coef * (log_probabilities.detach() + target)).mean()
-        self.entropy_optimizer.zero_grad()
-        entropy_loss.backward()
-        self.divergence_watch.step("entropy's factor", self.entropy_optimizer, entropy_loss)
+        parts = self.actor, policy.inference
+        norms = th.stack([th.nn.utils.clip_grad_norm_(part.parameters(), self.max_grad_norm) for part in parts])
+        self.divergence_watch.step(["actor"], self.actor.optimizer, loss, norms.sum(), bounded=False)
+        self._tune_entropy(log_probabilities, metrics)
         metrics["actor_loss"].append(-returns.mean().detach())
         metrics["latent_information"].append(ratios.mean().detach())
-        metrics["entropy_coef"].append(self.entropy_coef)
 
     def _update_targets(self) -> None:
         self._n_model_updates += 1
@@ -528,7 +515,3 @@ class RPG(NoveltyActorCritic):
         """
         latents = convert(tree.get("latents"), np.ndarray, "episodes.latents")
         self._episode_latents = check_array(latents, np.float32, [self.n_envs, self.latent_dim], "episodes.latents").copy()
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        names, variables = super()._get_torch_save_params()
-        return [*names, "entropy_optimizer"], variables

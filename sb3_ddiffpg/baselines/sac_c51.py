@@ -2,7 +2,6 @@
 
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
@@ -13,6 +12,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_ddiffpg.baselines.baseline import Baseline, MlpActorPolicy, names_of
+from sb3_ddiffpg.baselines.entropy_tuning import EntropyTuning
 from sb3_ddiffpg.buffers import ModeBatch
 from sb3_ddiffpg.twin_critic_policy import Actor
 
@@ -84,18 +84,17 @@ class GaussianActorPolicy(MlpActorPolicy):
         self.log_entropy_coef = nn.Parameter(th.zeros(()))
 
 
-class SACC51(Baseline):
+class SACC51(EntropyTuning, Baseline):
     """
     SAC (Haarnoja et al., 2018, https://arxiv.org/abs/1812.05905) with C51 critics and NovelD; the entropy is part of the
-    projected target. Its own noise explores: there is no other unless ``action_noise`` is given.
+    projected target.
 
     :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
-    :param entropy_learning_rate: Learning rate of the entropy's factor
-    :param initial_entropy_coef: Its first value
-    :param target_entropy: Entropy that it aims at; None: minus the action's size
+    :param entropy_learning_rate: As in ``EntropyTuning``
+    :param initial_entropy_coef: As there
     :param target_policy_noise: As in ``NoveltyActorCritic``
-    :param kwargs: Of ``Baseline`` and ``NoveltyActorCritic``
+    :param kwargs: Of ``EntropyTuning``, ``Baseline`` and ``NoveltyActorCritic``
     """
 
     policy: GaussianActorPolicy
@@ -108,28 +107,17 @@ class SACC51(Baseline):
         *,
         entropy_learning_rate: float = 5e-3,
         initial_entropy_coef: float = 1.0,
-        target_entropy: float | None = None,
         target_policy_noise: float = 0.0,
         **kwargs: Any,
     ) -> None:
-        self.entropy_learning_rate = entropy_learning_rate
-        self.initial_entropy_coef = initial_entropy_coef
-        self.target_entropy = target_entropy
-        super().__init__(policy, env, target_policy_noise=target_policy_noise, **kwargs)
-
-    def _setup_model(self) -> None:
-        no_noise = self.action_noise is None
-        super()._setup_model()
-        if no_noise:
-            self.action_noise = None
-        with th.no_grad():
-            self.policy.log_entropy_coef.fill_(float(np.log(self.initial_entropy_coef)))
-        self.entropy_optimizer = th.optim.Adam([self.policy.log_entropy_coef], lr=self.entropy_learning_rate)
-
-    @property
-    def entropy_coef(self) -> th.Tensor:
-        """The factor alpha of the entropy, a scalar."""
-        return self.policy.log_entropy_coef.detach().exp()
+        super().__init__(
+            policy,
+            env,
+            entropy_learning_rate=entropy_learning_rate,
+            initial_entropy_coef=initial_entropy_coef,
+            target_policy_noise=target_policy_noise,
+            **kwargs,
+        )
 
     def _next_actions(self, batch: ModeBatch) -> tuple[th.Tensor, th.Tensor | float]:
         actor = self.actor if self.actor_tau is None else self.policy.actor_target
@@ -138,16 +126,6 @@ class SACC51(Baseline):
 
     def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
         actions, log_probabilities = self.actor.sample(batch.observations)
-        target = -float(actions.shape[1]) if self.target_entropy is None else self.target_entropy
-        log_coef = self.policy.log_entropy_coef
-        entropy_loss = -(log_coef * (log_probabilities.detach() + target)).mean()
-        metrics["entropy_coef"].append(self.entropy_coef)
         values = self._values(batch, actions).min(dim=0).values
         metrics["actor_loss"].append(self._step_actor((self.entropy_coef * log_probabilities - values).mean()))
-        self.entropy_optimizer.zero_grad()
-        entropy_loss.backward()
-        self.divergence_watch.step("entropy's factor", self.entropy_optimizer, entropy_loss)
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        names, variables = super()._get_torch_save_params()
-        return [*names, "entropy_optimizer"], variables
+        self._tune_entropy(log_probabilities, metrics)
