@@ -163,6 +163,11 @@ def _wait_for(condition, seconds=120):
         time.sleep(0.05)
 
 
+def _checkpoints(folder):
+    """Those after the first step."""
+    return [path for path in folder.rglob("checkpoint_*.safetensors") if int(path.stem.split("_")[1])]
+
+
 def _processes():
     """Number, parent's number and command line of each."""
     return subprocess.run(["ps", "-wweo", "pid,ppid,args"], capture_output=True, text=True).stdout.split("\n")
@@ -176,7 +181,7 @@ def test_a_process_that_dies_is_started_again(tiny, tmp_path):
     executor = LocalExecutor(workers=1, retries=1)
 
     def kill():
-        _wait_for(lambda: list((tmp_path / place).rglob("checkpoint_*.safetensors")))
+        _wait_for(lambda: _checkpoints(tmp_path / place))
         os.kill(next(iter(executor._running)).pid, signal.SIGKILL)
 
     killer = threading.Thread(target=kill)
@@ -215,8 +220,8 @@ def test_ctrl_c_ends_all_with_a_checkpoint(tiny, tmp_path, start):
     _wait_for(lambda: len(list((tmp_path / "out").rglob("progress.json"))) == 2)
     process.send_signal(signal.SIGINT)
     assert process.wait(90) != 0
-    assert {path.parents[2].name for path in (tmp_path / "out").rglob("checkpoint_*")} == {"seed0"}
-    assert len(list((tmp_path / "out").rglob("checkpoint_*"))) == 2
+    assert {path.parents[2].name for path in _checkpoints(tmp_path / "out")} == {"seed0"}
+    assert len(_checkpoints(tmp_path / "out")) == 2
 
 
 def test_a_runner_that_is_killed_leaves_no_process(tiny, tmp_path, start):
@@ -227,7 +232,7 @@ def test_a_runner_that_is_killed_leaves_no_process(tiny, tmp_path, start):
     process.kill()
     process.wait()
     # Each writes a checkpoint when the other end of its standard input closes
-    _wait_for(lambda: len(list((tmp_path / "out").rglob("checkpoint_*.safetensors"))) >= 2, 90)
+    _wait_for(lambda: len(_checkpoints(tmp_path / "out")) >= 2, 90)
     _wait_for(lambda: not [line for line in _processes() if str(tmp_path) in line], 60)
 
 
@@ -258,7 +263,7 @@ def test_a_ray_worker_that_is_killed_is_replaced(tmp_path, start):
     command = [sys.executable, "-m", "sb3_ddiffpg.experiments", "run", str(path), "--out", str(tmp_path / "out")]
     process = start([*command, "--ray", "--workers", "2", "--no-report"])
     place = tmp_path / "out" / "PointMazeV1-v0" / "ddiffpg" / "seed0"
-    _wait_for(lambda: list(place.rglob("checkpoint_*.safetensors")), 240)
+    _wait_for(lambda: _checkpoints(place), 240)
     worker = next(int(line.split()[1]) for line in _processes() if "trial" in line and str(place) in line)
     os.kill(worker, signal.SIGKILL)
     said = process.communicate(timeout=400)[0].decode()
