@@ -193,13 +193,18 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         for row_set in self.mode_rows:
             row_set.position = self._mode_position
 
+    def _check_step(self, obs: Any, next_obs: Any, *args: Any) -> None:
+        super()._check_step(obs, next_obs, *args)
+        positions = self.features(next_obs)
+        self.check_finite("mode features", positions)
+        self._last_positions = positions
+
     def _write_rows(self, rows: np.ndarray, obs: Any, next_obs: Any, action: np.ndarray, *args: Any) -> None:
         super()._write_rows(rows, obs, next_obs, action, *args)
         for name in ("target_actions", "exploratory_target_actions"):
             self._steps.write(name, rows, action)
         self.foreign[rows] = self.off_route[rows] = self.goals[rows] = False
         self.way_novelty[rows] = 0.0
-        self._last_positions = self.features(next_obs)
         if self.visit_cell_size is None:
             self.first_visits[rows] = True
             return

@@ -271,9 +271,14 @@ class RunCheckpointCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         # Here everything that belongs to the steps so far has been done
-        if self._first and not checkpoint_files(self.folder):
-            write_checkpoint(self._path(), self.model, self.all_callbacks)  # what cannot be saved ends it now, not in hours
-        self._first = False
+        if self._first:
+            self._first = False
+            try:
+                # What cannot be saved ends the training now, not in hours
+                write_checkpoint(self._path(), self.model, self.all_callbacks)
+            except OSError:
+                if not checkpoint_files(self.folder):
+                    raise
         due = self.num_timesteps // self.save_freq > self._last // self.save_freq
         if due or self._signal is not None:
             self.save()

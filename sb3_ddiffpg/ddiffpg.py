@@ -73,7 +73,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param v_min: Lower end of the values' support
     :param v_max: Upper end of the support of the modes' critics
     :param exploration_v_max: Upper end of the support of the exploratory critics (the lower end is 0); None: what novelty can
-        be worth at most, ``10 * intrinsic_coef / (1 - gamma)``, or ``v_max`` if that is more
+        be worth at most, ``intrinsic_clip * intrinsic_coef / (1 - gamma)``, or ``v_max`` if that is more
     :param reward_scale: Factor on the environment's reward
     :param mode_n_steps: Length of the multi-step returns of the modes' critics (uncorrected)
     :param exploration_n_steps: The same for the exploratory critics

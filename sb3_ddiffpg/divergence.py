@@ -8,6 +8,8 @@ import torch as th
 
 # A loss this many times the square of the critics' support is an explosion: values a thousand supports away
 EXPLODED = 1e6
+#: Squares of smaller numbers, and sums of some, fit into 32 bits
+LARGEST = 1e18
 
 
 class DivergedError(ArithmeticError):
@@ -39,8 +41,8 @@ class _Seen(NamedTuple):
 
 class DivergenceWatch:
     """
-    Looks at what is about to change parameters or the buffer. On the CPU it raises at once; an accelerator, which nothing here
-    waits for, takes no such step, and ``report`` raises.
+    Looks at what is about to change parameters or the buffer. On the CPU it raises at once; an accelerator, which is waited
+    for only where an optimiser is not fused, takes no such step, and ``report`` raises.
 
     :param device: Where training is computed
     :param largest_loss: Above this a loss has exploded
@@ -83,12 +85,12 @@ class DivergenceWatch:
         """
         :param name: What they are
         :param values: Any shape
-        :param instead: What stands for those that are not finite, where nothing is raised at once
+        :param instead: What stands for those that are not finite, or not below ``LARGEST``, where nothing is raised at once
         :return: The values
         :raises DivergedError: See the class
         """
-        self._look([name], values.detach().abs().max().reshape(1), [math.inf])
-        return values if self._at_once else th.where(values.isfinite(), values, instead)
+        self._look([name], values.detach().abs().max().reshape(1), [LARGEST])
+        return values if self._at_once else th.where(values.abs() < LARGEST, values, instead)
 
     def _look(self, names: list[str], values: th.Tensor, limits: list[float]) -> None:
         self._seen.append(_Seen(names, values, limits))
@@ -107,7 +109,7 @@ class DivergenceWatch:
         wrong = {name: f"{name} is {value:.4g}" for name, value, limit in given if not abs(value) < limit}
         if wrong:
             raise DivergedError(
-                f"Training has diverged: {'; '.join(wrong.values())}. No parameter has taken part of it: the model is as it "
-                "was before, and can be saved. A lower learning_rate, rewards within the critics' support [v_min, v_max], or "
-                "observations of moderate size (VecNormalize) may help"
+                f"Training has diverged: {'; '.join(wrong.values())}. Nothing of it has reached a parameter or the "
+                "replay buffer: the model can be saved. A lower learning_rate, rewards within the critics' support "
+                "[v_min, v_max], or observations of moderate size (VecNormalize) may help"
             )

@@ -255,8 +255,11 @@ class ModeEvaluation:
             return {**row, "mean_length": _nan(row["mean_length"]), "mean_return": _nan(row["mean_return"])}
 
         counted = {name: value for name, value in data.items() if name not in ("format", "summary", "episodes")}
-        counted["uncommanded"] = command(data["uncommanded"])
-        counted["commanded"] = [command(row) for row in data["commanded"]]
+        try:
+            counted["uncommanded"] = command(data["uncommanded"])
+            counted["commanded"] = [command(row) for row in data["commanded"]]
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"evaluation: {error!r}") from None
         found = convert(counted, ModeEvaluation, "evaluation")
         for each in (found.uncommanded, *found.commanded):
             counts = each.labels.values()

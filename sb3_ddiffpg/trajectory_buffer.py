@@ -12,6 +12,7 @@ from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_ddiffpg.divergence import LARGEST
 from sb3_ddiffpg.features import Observation
 from sb3_ddiffpg.row_storage import Fields, HostRows, make_rows
 from sb3_ddiffpg.trajectories import NO_MODE, RowSet, SuccessRule, Trajectory
@@ -25,8 +26,8 @@ class TrajectoryReplayBuffer(ReplayBuffer):
     Transitions live in rows; a finished trajectory owns its rows. When rows run out, the oldest retired trajectory is evicted,
     then the oldest of whichever group (mode and outcome) holds most rows, so that a rare mode is never crowded out.
 
-    Storage is allocated at the first ``add``: a model that is loaded to act needs none. What the networks see may live on an
-    accelerator (``storage_device``); what decides which rows are read always stays in the main memory.
+    Storage is allocated by ``allocate`` or the first ``add``: a model that is loaded to act needs none. What the networks see
+    may live on an accelerator (``storage_device``); what decides which rows are read always stays in the main memory.
 
     :param buffer_size: Capacity in transitions (over all environments)
     :param observation_space: Observation space
@@ -283,8 +284,7 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         """
         self.allocate()
         action = np.asarray(action, dtype=np.float32).reshape(self.n_envs, self.action_dim)
-        for name, value in (("observation", obs), ("next observation", next_obs), ("action", action), ("reward", reward)):
-            self.check_finite(name, value)
+        self._check_step(obs, next_obs, action, reward)
         rows = self._take_rows(self.n_envs)
         self._write_rows(rows, obs, next_obs, action, reward, done)
         self._all.add(rows)
@@ -302,6 +302,10 @@ class TrajectoryReplayBuffer(ReplayBuffer):
             if self.handle_timeout_termination:
                 self.timeouts[rows[env]] = bool(infos[env].get("TimeLimit.truncated", False))
             self.just_finished.append((int(env), self._finish(int(env), infos[env])))
+
+    def _check_step(self, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray) -> None:
+        for name, value in (("observation", obs), ("next observation", next_obs), ("action", action), ("reward", reward)):
+            self.check_finite(name, value)
 
     def _write_rows(
         self, rows: np.ndarray, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray, done: np.ndarray
@@ -325,15 +329,14 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         """
         :param name: What the value is, for the message
         :param value: One row per environment, or a dict of such
-        :raises ValueError: If a value is not finite, naming the environment
+        :raises ValueError: If a value is not finite, or its square is not in 32 bits, naming the environment
         """
         for array in value.values() if isinstance(value, dict) else [value]:
             array = np.asarray(array)
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
-                env = int(np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))[0])
-                raise ValueError(
-                    f"The {name} of environment {env} is not finite: {array[env]}. Nothing of this step was stored"
-                )
+            if array.dtype.kind == "f" and not (good := np.abs(array) < LARGEST).all():
+                env = int(np.flatnonzero(~good.reshape(len(array), -1).all(axis=1))[0])
+                what = "too large" if np.isfinite(array[env]).all() else "not finite"
+                raise ValueError(f"The {name} of environment {env} is {what}: {array[env]}. Nothing of this step was stored")
 
     def _finish(self, env: int, info: dict[str, Any]) -> Trajectory:
         length = self._running_length[env]

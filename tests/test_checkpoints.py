@@ -215,6 +215,16 @@ def test_what_cannot_be_saved_is_said_before_the_first_step(tmp_path):
     with pytest.raises(TypeError, match="left: <object object .* cannot be saved"):
         model.learn(100, callback=RunCheckpointCallback(tmp_path))
     assert model.num_timesteps == 0 and not checkpoint_files(tmp_path)
+    # Nor does a file that is there already make it go unnoticed
+    model = model_for(known_ends())
+    model.learn(100, callback=RunCheckpointCallback(tmp_path, save_freq=50))
+
+    class Unsayable(RunCheckpointCallback):
+        def state_dict(self):
+            return {"what": object()}
+
+    with pytest.raises(TypeError, match="what: <object object .* cannot be saved"):
+        model.learn(100, callback=[RunCheckpointCallback(tmp_path), Unsayable(tmp_path)], reset_num_timesteps=False)
 
 
 def test_what_cannot_be_saved_later_does_not_end_the_training(tmp_path):

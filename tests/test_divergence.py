@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from environments import TwoEnds, small_model
+from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
@@ -13,6 +14,7 @@ from torch import nn
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES, RPG, SACC51
 from sb3_ddiffpg.divergence import DivergedError, DivergenceWatch, step_unless
+from sb3_ddiffpg.intrinsic import VisitCounts
 
 ALGORITHMS = {"ddiffpg": DDiffPG, **BASELINES}
 
@@ -120,6 +122,63 @@ def test_novelty_that_is_no_number_does_not_reach_its_running_scale(monkeypatch)
             model.train(1, 32)
     assert all(th.equal(tensor, before[name]) for name, tensor in model.intrinsic_moments.state_dict().items())
     assert all(th.equal(now, then) for now, then in zip(model.novelty_model.parameters(), weights, strict=True))
+
+
+class Far(TwoEnds):
+    """Once, an observation of any size."""
+
+    def __init__(self, value, dtype=np.float32):
+        super().__init__()
+        self.value, self.n_steps = value, 0
+        self.observation_space = spaces.Box(-np.inf, np.inf, (2,), dtype)
+
+    def step(self, action):
+        self.n_steps += 1
+        observation, *rest = super().step(action)
+        observation = observation.astype(self.observation_space.dtype)
+        return (observation if self.n_steps != 15 else np.full_like(observation, self.value)), *rest
+
+
+@pytest.mark.parametrize(("value", "dtype"), [(1e25, np.float32), (1e300, np.float64), (-np.inf, np.float32)])
+def test_what_does_not_fit_into_squares_of_32_bits_is_refused_with_its_environment(value, dtype):
+    """Or running statistics, such as RND's scale, would never be numbers again."""
+    env = DummyVecEnv([TwoEnds, lambda: Far(value, dtype)] if dtype == np.float32 else [lambda: Far(value, dtype)] * 2)
+    env.observation_space = spaces.Box(-np.inf, np.inf, (2,), dtype)
+    model = small_model(env, novelty="rnd", learning_starts=200)
+    with pytest.raises(ValueError, match=r"next observation of environment \d is (too large|not finite)"):
+        model.learn(100)
+    assert all(tensor.isfinite().all() for tensor in model.novelty_model.state_dict().values())
+    stored = model.replay_buffer._all.rows[: model.replay_buffer.size()]
+    assert len(stored) == 28 and np.isfinite(model.replay_buffer.next_observations[stored]).all()
+    if dtype == np.float32:
+        model.learn(100)
+
+
+def test_mode_features_that_are_no_numbers_are_refused():
+    model = small_model(DummyVecEnv([TwoEnds] * 2), novelty="rnd", mode_features=lambda obs: np.log(obs[:, :1] - 5.0))
+    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match="mode features of environment 0 is not finite"):
+        model.learn(100)
+    assert model.replay_buffer.size() == 0
+
+
+class Surprised(VisitCounts):
+    """Finite, but not its square."""
+
+    def novelty(self, positions, observations):
+        return super().novelty(positions, observations) * 1e25
+
+
+def test_novelty_too_large_for_its_running_scale_is_noticed():
+    model = small_model(DummyVecEnv([TwoEnds] * 2), novelty=Surprised)
+    with pytest.raises(DivergedError, match="the novelty is"):
+        model.learn(100)
+    assert all(tensor.isfinite().all() for tensor in model.intrinsic_moments.state_dict().values())
+
+
+@pytest.mark.parametrize("name", ["rpg", "sac_c51"])
+def test_entropy_may_be_switched_off(name):
+    model = trained(BASELINES[name], initial_entropy_coef=0.0)
+    assert model.entropy_coef == 0.0 and model._n_updates > 0
 
 
 @pytest.mark.parametrize("optimizer", [th.optim.Adam, th.optim.AdamW, th.optim.SGD, th.optim.RMSprop])

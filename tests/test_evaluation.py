@@ -152,6 +152,8 @@ def test_json(tmp_path):
     assert data["summary"]["robust_modes"] == 2 and data["commanded"][2]["mean_length"] is None
     again = ModeEvaluation.load(tmp_path / "found.json")
     assert str(again) == str(found) and again.uncommanded == found.uncommanded and again.ways == found.ways
+    with pytest.raises(ValueError, match="uncommanded"):
+        ModeEvaluation.from_dict({"format": 1})
     (tmp_path / "other.json").write_text('{"format": 0}')
     with pytest.raises(ValueError, match="is no evaluation of modes in format 1"):
         ModeEvaluation.load(tmp_path / "other.json")

@@ -183,13 +183,14 @@ def test_a_suite_that_says_anything(suite):
 
 @given(
     rows=st.lists(st.text("#.rg01x", max_size=9), max_size=9)
+    | st.recursive(st.sampled_from([None, 1, 0, "r", "g"]), lambda each: st.lists(each, max_size=3), max_leaves=8)
     | hnp.arrays(np.int64, hnp.array_shapes(max_dims=3, max_side=6)).map(list),
     inside=st.booleans(),
     path=hnp.arrays(np.float64, st.tuples(st.integers(0, 6), st.just(2)), elements=st.floats(-30, 30)),
 )
 @MANY
 def test_a_maze_of_any_rows(rows, inside, path):
-    if inside and rows and isinstance(rows[0], str):
+    if inside and rows and isinstance(rows, list) and all(isinstance(row, str) for row in rows):
         width = max(map(len, rows))
         rows = ["#" * (width + 2), *(f"#{row.ljust(width, '.')}#" for row in rows), "#" * (width + 2)]
     try:

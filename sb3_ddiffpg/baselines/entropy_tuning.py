@@ -64,9 +64,8 @@ class EntropyTuning(NoveltyActorCritic):
         """
         target = -float(np.prod(self.action_space.shape or (1,))) if self.target_entropy is None else self.target_entropy
         slope = -(log_probabilities.detach() + target).mean()
-        self._log_entropy_coef.grad = slope
-        loss = self._log_entropy_coef.detach() * slope
-        self.divergence_watch.step(["entropy's factor"], self.entropy_optimizer, loss, slope.abs())
+        self._log_entropy_coef.grad = slope  # of the loss: slope * logarithm, which is infinite for a factor of 0
+        self.divergence_watch.step(["entropy's factor"], self.entropy_optimizer, slope, slope.abs(), bounded=False)
         metrics["entropy_coef"].append(self.entropy_coef)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -104,6 +104,10 @@ def _cells_where(mask: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(i, j) for i, j in np.argwhere(mask).tolist()]
 
 
+def _has_entries(value: Any) -> bool:
+    return isinstance(value, Sequence) or (isinstance(value, np.ndarray) and value.ndim > 0)
+
+
 def _read_map(maze_map: MazeMap) -> tuple[str, ...]:
     """
     :param maze_map: name or map
@@ -114,8 +118,8 @@ def _read_map(maze_map: MazeMap) -> tuple[str, ...]:
         if maze_map not in MAZES:
             raise ValueError(f"maze_map: {maze_map!r} is no known maze; give one of {', '.join(MAZES)} or a list of rows")
         maze_map = MAZES[maze_map]
-    if not all(isinstance(row, str | Sequence | np.ndarray) and np.ndim(row) <= 1 for row in maze_map):
-        raise ValueError(f"maze_map: accepted are rows of cells, got {maze_map!r}")
+    if not (_has_entries(maze_map) and all(map(_has_entries, maze_map))):
+        raise ValueError(f"maze_map: accepted are a name, or rows of cells, got {maze_map!r}")
     for row in maze_map:
         for cell in row:
             if str(cell) not in _CELL_SYMBOLS:

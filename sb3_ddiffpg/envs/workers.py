@@ -114,7 +114,8 @@ class WorkerVecEnv(VecEnv):
 
     :param env_fns: functions that make the environments
     :param n_workers: number of processes; None: one per processor that this process may use
-    :param timeout: seconds for which the environments of a worker may be at work on one answer; None: for ever
+    :param timeout: seconds for which the environments of a worker may be at work on one answer, the first of which comes after
+        the process has begun and made them; None: for ever
     :raises ValueError: if ``n_workers`` is less than 1, or ``timeout`` is not positive
     """
 
@@ -208,7 +209,8 @@ class WorkerVecEnv(VecEnv):
     def _give_up(self, worker: int) -> NoReturn:
         turn, first, last = self._turns[worker].value, self.first[worker], self.first[worker + 1] - 1
         who = f"The worker process with environments {first} to {last}" if turn == _NOBODY else f"Environment {first + turn}"
-        self.processes[worker].kill()  # it would not hear that it is to close
+        for process in self.processes:
+            process.kill()  # who hangs would not hear that he is to close
         self.close()
         raise RuntimeError(f"{who} has hung: no answer for {self.timeout:g} seconds (timeout of WorkerVecEnv)")
 
