@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from sb3_ddiffpg.divergence import DivergenceWatch
 from sb3_ddiffpg.row_storage import DeviceRows, HostRows
 
 FIELDS = {
@@ -142,6 +143,7 @@ def test_an_update_never_waits_for_the_device(settings, stored_on_device, monkey
         raise AssertionError("this waits for the device")
 
     monkeypatch.setattr("sb3_ddiffpg.critics.LARGE_ASCENT", 10**9)
+    model.divergence_watch = DivergenceWatch(th.device("cuda"))  # looks later
     model.replay_buffer.storage_device = th.device("cuda")  # only asked whether target actions must come back
     metrics = defaultdict(list)
     if "mode_intrinsic_coef" in settings:
