@@ -417,6 +417,16 @@ class NoveltyActorCritic(SavableAlgorithm):
         norms = policy.critics.clip_gradients(self.max_grad_norm)
         return losses.detach(), norms, policy.critics.share_at_top(targets)
 
+    def _improve_target_actions(self, batch: ModeBatch) -> th.Tensor:
+        """
+        ``a_target <- a_target + eta * grad_a Q_i(s, a_target)``, K times, written back to the buffer, of algorithms that have
+        an ``"ascent"`` among their graphs. [G, n, action_dim]
+        """
+        improved = self.graphs["ascent"](batch)
+        improved = self.divergence_watch.finite("a target action", improved, batch.target_actions)
+        self.replay_buffer.store_target_actions(batch, improved)
+        return improved
+
     def _update_targets(self) -> None:
         policy = self.policy
         online = [*policy.critics.parameters(), *policy.critic_features_extractor.parameters()]

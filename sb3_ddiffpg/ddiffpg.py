@@ -426,13 +426,6 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         embeddings = self._row_embeddings(batch, masked=self.backup_embedding == "masked")
         return self.actor(batch.next_observations, embeddings=embeddings), 0.0
 
-    def _improve_target_actions(self, batch: ModeBatch) -> th.Tensor:
-        """a_target <- a_target + eta * grad_a Q_i(s, a_target), K times, written back to the buffer. [G, n, action_dim]"""
-        target_actions = self.graphs["ascent"](batch)
-        target_actions = self.divergence_watch.finite("a target action", target_actions, batch.target_actions)
-        self.replay_buffer.store_target_actions(batch, target_actions)
-        return target_actions
-
     def _ascend(self, batch: ModeBatch) -> th.Tensor:
         with th.no_grad():
             features = self.policy.critic_features(batch.observations)

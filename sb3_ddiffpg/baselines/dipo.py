@@ -114,13 +114,6 @@ class DIPO(Baseline):
         condition = self.actor.condition(batch.observations)
         metrics["actor_loss"].append(self._step_actor(self.actor.diffusion.loss(improved.flatten(0, 1), condition)))
 
-    def _improve_target_actions(self, batch: ModeBatch) -> th.Tensor:
-        """They climb the critics, and return to the buffer. [1, n, action_dim]"""
-        improved = self.graphs["ascent"](batch)
-        improved = self.divergence_watch.finite("a target action", improved, batch.target_actions)
-        self.replay_buffer.store_target_actions(batch, improved)
-        return improved
-
     def _ascend(self, batch: ModeBatch) -> th.Tensor:
         with th.no_grad():
             features = self.policy.critic_features(batch.observations)
