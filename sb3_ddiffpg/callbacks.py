@@ -150,8 +150,8 @@ class EvaluateModesCallback(_PeriodicCallback):
     :param n_episodes: Episodes for each command, and twice as many without
     :param path: Of a file to which each evaluation is appended, one line of JSON each
     :param best_model_path: Of a .zip file, where the model is saved (and ``vecnormalize.pkl`` beside it) whenever its
-        ``commanded_modes``, then its uncommanded successes, are as many as never before. Evaluate it again, in fresh episodes,
-        before you report it: it was chosen for these
+        ``commanded_modes``, then its number of modes, then its uncommanded successes, are as many as ever before. Evaluate it
+        again, in fresh episodes, before you report it: it was chosen for these
     :param kwargs: Further arguments of ``evaluate_modes``
     """
 
@@ -172,7 +172,7 @@ class EvaluateModesCallback(_PeriodicCallback):
             raise ValueError(f"best_model_path: {best_model_path} given; accepted is the path of a .zip file")
         #: Environment steps at which the best model was saved, None: not yet
         self.best_step: int | None = None
-        self._best = (-1.0, -1.0)
+        self._best = (-1.0, -1, -1.0)
         #: Environment steps and what was found, without the episodes
         self.evaluations: list[tuple[int, ModeEvaluation]] = []
 
@@ -194,7 +194,7 @@ class EvaluateModesCallback(_PeriodicCallback):
         :raises ValueError: If it is something else
         """
         super().load_state_dict(state)
-        self._best = convert(state.get("best"), tuple[float, float], "callback.best")
+        self._best = convert(state.get("best"), tuple[float, int, float], "callback.best")
         self.best_step = convert(state.get("best_step"), int | None, "callback.best_step")
         evaluations = convert(state.get("evaluations"), list[tuple[int, dict[str, Any]]], "callback.evaluations")
         self.evaluations = [(step, ModeEvaluation.from_dict(each)) for step, each in evaluations]
@@ -227,8 +227,9 @@ class EvaluateModesCallback(_PeriodicCallback):
         if self.path is not None:
             with self.path.open("a") as file:
                 file.write(self._line(self.num_timesteps, found))
-        score = (found.commanded_modes, found.uncommanded.success_rate)
-        if self.best_model_path is not None and score > self._best:
+        # A model whose modes fail yet is more than luck without any, and of equals the later one has seen more
+        score = (found.commanded_modes, len(found.commanded), found.uncommanded.success_rate)
+        if self.best_model_path is not None and score >= self._best:
             unfinished = self.best_model_path.with_name(f".{self.best_model_path.stem}.zip")
             self.model.save(unfinished)
             os.replace(unfinished, self.best_model_path)  # whole, or the one before

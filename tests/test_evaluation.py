@@ -15,6 +15,7 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.vec_env import DummyVecEnv
 from test_episodes import Scripted
 
+from sb3_ddiffpg import DDiffPG, EvaluateModesCallback
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.evaluation import CommandResult, ModeEvaluation, WayResult, evaluate_modes
 
@@ -27,6 +28,29 @@ def evaluation(labels, n, commanded=(), listed=()):
     names = list(dict.fromkeys([*labels, *(label for each in commanded for label in each.labels)]))
     ways = tuple(WayResult(name, 1, 1.0, 1.0) for name in names)
     return ModeEvaluation("any", "environment", tuple(listed), 0.0, result(None, n, labels), tuple(commanded), ways)
+
+
+def test_which_model_is_kept(monkeypatch, tmp_path):
+    """What modes achieve counts first, then that there are any; luck without command is last, and ties go to the later one."""
+    fails, succeeds = result("a", 20, {}), result("a", 20, {"0": 1})
+    found = [
+        evaluation({"0": 1}, 40),
+        evaluation({}, 40, [fails]),
+        evaluation({"0": 9}, 40),
+        evaluation({}, 40, [fails]),
+        evaluation({}, 40, [succeeds]),
+        evaluation({"0": 9}, 40, [fails]),
+        evaluation({}, 40, [succeeds]),
+    ]
+    model, kept, tests = small_model(TwoEnds()), [], iter(found)
+    monkeypatch.setattr("sb3_ddiffpg.callbacks.evaluate_modes", lambda *args, **kwargs: next(tests))
+    callback = EvaluateModesCallback(None, eval_freq=1, best_model_path=tmp_path / "model.zip")
+    for number in range(1, 8):
+        model.learn(1, callback=callback, reset_num_timesteps=number == 1)
+        kept.append(callback.best_step)
+    rollout = kept[0]
+    assert kept == [number * rollout for number in (1, 2, 2, 4, 5, 5, 7)]
+    assert DDiffPG.load(tmp_path / "model.zip").num_timesteps == 7 * rollout
 
 
 # ---------------------------------------------------------------------- the numbers
