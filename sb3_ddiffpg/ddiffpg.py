@@ -53,7 +53,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param learning_starts: Steps of random actions before learning starts
     :param batch_size: Transitions per update, split evenly over the exploratory group and the modes
     :param tau: Soft update coefficient of the target critics
-    :param gamma: Discount factor
+    :param gamma: Discount factor. A goal L steps away is worth ``gamma ** L`` of itself: much less than 0.1 at the start of a
+        mode's first trajectories, and its critics do not see it there
     :param train_freq: Update the model every ``train_freq`` steps (of all environments), or a tuple with the unit
     :param gradient_steps: Updates after each rollout; -1: as many as transitions were collected
     :param action_noise: Exploration noise; None: Gaussian, its standard deviation drawn per episode from [.05, .6]
