@@ -111,6 +111,7 @@ def test_settings_that_do_not_exist(monkeypatch, tmp_path, capsys):
         ((*point, "--override", "{lerning_rate: 1}"), "did you mean 'learning_rate'"),
         ((*point, "--override", "{n_timesteps: 0}"), "n_timesteps: 0 given"),
         ((*point, "--override", "{n_timesteps: .nan}"), "n_timesteps: nan given"),
+        ((*point, "--settings", "{policy: MlpPolicy}"), "n_timesteps: None given"),
         ((*point, "--settings", "{gamma: 1}", "--override", "{gamma: 1}"), "one or the other"),
         ((*point, "--members", "0"), "members: 0 given"),
         (("--again", str(tmp_path), "--seed", "5"), "--again: given beside seed"),
@@ -179,14 +180,19 @@ def test_settings_are_looked_at_again_under_the_lock(tmp_path):
         "trial",
         "--env",
         "PointMazeV1-v0",
-        "--seed",
-        "1",
         "--tests",
         TESTS,
+        "--override",
+        SMALL,
+        "--out",
+        str(tmp_path),
     ]
+    started = time.monotonic()
+    assert subprocess.run([*command, "--seed", "-1"], capture_output=True).returncode == 2
+    looked = time.monotonic() - started
     with FileLock(tmp_path / "logs" / "lock"):
-        process = subprocess.Popen([*command, "--override", SMALL, "--out", str(tmp_path)], stderr=subprocess.PIPE, text=True)
-        time.sleep(15)  # it has looked, and waits
+        process = subprocess.Popen([*command, "--seed", "1"], stderr=subprocess.PIPE, text=True)
+        time.sleep(2 * looked)  # it has looked, and waits
         assert process.poll() is None
         record = {"algo": "ddiffpg", "env": "PointMazeV1-v0", "seed": 0, "hyperparams": {}, "result": {"complete": True}}
         (tmp_path / "config.yml").write_text(yaml.safe_dump(record))

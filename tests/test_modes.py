@@ -450,7 +450,10 @@ def test_max_modes():
 @pytest.mark.slow
 def test_thousands_of_successes():
     """Five thousand at once, of two routes and a third that few took: who owns which is right, and nothing is lost."""
-    model = planar_model(distance_threshold=None, max_successes_per_mode=3000, buffer_size=100_000, min_mode_size=5)
+    fast = {"n_path_points": 12}
+    model = planar_model(
+        distance_threshold=None, max_successes_per_mode=3000, buffer_size=100_000, min_mode_size=5, replay_buffer_kwargs=fast
+    )
     counts = {"up": 2900, "down": 2080, "right": 20}
     for route, count in counts.items():
         walk(model, route, count)

@@ -104,12 +104,12 @@ class Trial(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
             raise ValueError(f"also: {self.tests.also} given beside members: {self.members}; accepted is one of both")
         if self.hyperparams.get("normalize") and (self.tests.also or self.members > 1):
             raise ValueError("normalize: given beside also or members, whose environments are not normalised")
-        counts = {"members": self.members, "n_timesteps": self.hyperparams.get("n_timesteps", 1)}
+        counts: dict[str, Any] = {"members": self.members, "n_timesteps": self.hyperparams.get("n_timesteps")}
         counts |= {name: getattr(self.tests, name) for name in ("n_tests", "n_test_episodes", "n_episodes")}
         for name, value in counts.items():
             if not isinstance(value, (int, float)) or not 1 <= value < math.inf:
                 raise ValueError(f"{name}: {value!r} given; accepted are numbers from 1 up")
-        if counts["n_timesteps"] < self.members and "n_timesteps" in self.hyperparams:
+        if counts["n_timesteps"] < self.members:
             raise ValueError(
                 f"members: {self.members} given for {counts['n_timesteps']:g} steps; accepted is one step for each"
             )
