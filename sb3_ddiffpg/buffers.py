@@ -43,9 +43,6 @@ class ModeBatch(NamedTuple):
     windows: np.ndarray
 
 
-# Successes in no mode that are remembered, if max_successes_per_mode is not more: of a rare way, few in a hundred are alike
-_STRAYS = 240
-
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
     *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct", "loop_share", "route_share"),
@@ -357,8 +354,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     ) -> None:
         """
         Hand the trajectories to their new modes and rebuild the modes' rows. Each mode learns from its newest direct successes
-        and its newest failures. As many detours are remembered for the next clustering, and successes of no mode; the
-        rest retires to exploration.
+        and its newest failures, and remembers as many detours for the next clustering; the rest retires to exploration.
 
         :param successes: In order of finishing
         :param success_modes: New mode of each, ``NO_MODE`` for outliers
@@ -383,9 +379,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
                     trajectory.trains = False
                 for trajectory in direct[-limit:]:
                     trajectory.trains = True
-                most = max(_STRAYS, limit) if mode == NO_MODE and trajectories is successes else limit
-                kept = [*direct[-limit:], *detours[-most:]]
-                dropped = [*direct[:-limit], *detours[:-most]]
+                kept = [*direct[-limit:], *detours[-limit:]]
+                dropped = [*direct[:-limit], *detours[:-limit]]
                 # How far the mode is from having its fill; what is in no mode is all new
                 novelty = 1.0 if mode == NO_MODE else 1.0 - min(len(direct) / limit, 1.0)
                 for trajectory in members:

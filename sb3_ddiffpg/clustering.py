@@ -23,7 +23,6 @@ __all__ = [
     "match_modes",
     "medoid",
     "resample_path",
-    "strangers",
 ]
 
 # Ward, centroid and median are left out: they are defined for Euclidean distances only, which DTW's are not.
@@ -81,8 +80,7 @@ def automatic_labels(distances: np.ndarray, linkage: str = "average", max_modes:
     silhouette, outliers counting zero, is taken. The same question is then put to each of its modes, so that two goals
     far apart do not hide the routes to each of them. If no cut is left, all trajectories are one mode, but for those few that
     join it last and from so far away that its silhouette beside them is as clear: the first of a rarer way, which would
-    otherwise be taken for its members and be forgotten among them. Among several modes, groups of outliers that lie as
-    clearly apart from every mode as these from one another are modes too: what is rare hardly counts in the mean.
+    otherwise be taken for its members and be forgotten among them.
 
     :param distances: as in :func:`cluster`
     :param linkage: as in :func:`cluster`
@@ -104,28 +102,7 @@ def automatic_labels(distances: np.ndarray, linkage: str = "average", max_modes:
             undecided.extend(parts)
         else:
             modes.append(_without_strays(tree, node, min_size))
-    if len(modes) > 1:
-        modes += _clear_leftovers(tree, modes, min_size)
     return _numbered(tree.groups(modes, max_modes), n)
-
-
-def strangers(distances: np.ndarray, members: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """
-    Which trajectories lie as clearly apart from a mode as another mode would: by how far they are from its members on
-    average, and these from one another, their silhouette is at least the automatic rule's 0.55.
-
-    :param distances: as in :func:`cluster`
-    :param members: indices of at least two trajectories that show how far the mode's own spread
-    :param others: indices of the trajectories in question
-    :return: bool array of the shape of ``others``
-    :raises ValueError: if there are fewer than two members
-    """
-    n = len(members)
-    if n < 2:
-        raise ValueError(f"members must be at least 2 trajectories, got {n}")
-    within = distances[np.ix_(members, members)].sum() / (n * (n - 1))
-    apart = distances[np.ix_(others, members)].mean(axis=1)
-    return (apart > within) & (apart - within >= _CLEAR_SILHOUETTE * apart)
 
 
 def assign_to_nearest(
@@ -304,27 +281,6 @@ class _MergeTree:
         values = np.divide(nearest - within, scale, out=np.zeros_like(scale), where=known)
         return np.bincount(owner, weights=values) / size
 
-    def outside(self, nodes: Sequence[int]) -> list[int]:
-        """The largest nodes in which no trajectory of ``nodes`` is."""
-        taken = np.zeros(len(self.order), dtype=bool)
-        for node in nodes:
-            taken[self.first[node] : self.first[node] + self.size[node]] = True
-        found, undecided = [], [self.root]
-        while undecided:
-            node = undecided.pop()
-            inside = taken[self.first[node] : self.first[node] + self.size[node]]
-            if not inside.any():
-                found.append(node)
-            elif not inside.all():
-                undecided.extend(self.children_of(node).tolist())
-        return found
-
-    def mean_distance(self, node: int, other: int) -> float:
-        """Between the members of two nodes, or those of one."""
-        rows = slice(self.first[node], self.first[node] + self.size[node])
-        total = (self.sums[rows, self.first[other] + self.size[other]] - self.sums[rows, self.first[other]]).sum()
-        return float(total / (self.size[node] * (self.size[other] - (node == other))))
-
     def groups(self, nodes: list[int], most: int) -> list[np.ndarray]:
         """Trajectories of disjoint nodes; those that meet lowest in the tree are joined until at most ``most`` are left."""
         owner = np.full(len(self.order), -1)
@@ -370,26 +326,6 @@ def _without_strays(tree: _MergeTree, node: int, min_size: int) -> int:
         if tree.size[core] < 4 * tree.size[stray] or tree.silhouettes(np.array([core, stray]))[0] < _CLEAR_SILHOUETTE:
             return node
         node = int(core)
-
-
-def _clear_leftovers(tree: _MergeTree, modes: Sequence[int], min_size: int) -> list[int]:
-    """Groups outside of the modes, each clearly apart from them, and they from it: see :func:`automatic_labels`."""
-    found: list[int] = []
-    undecided = tree.outside(modes)
-    while undecided:
-        node = undecided.pop()
-        if tree.size[node] < max(2, min_size):
-            continue
-        others = [*modes, *found]
-        # However alike the group, nobody is apart from a mode whose own members are as far from one another
-        apart = all(
-            (1 - _CLEAR_SILHOUETTE) * tree.mean_distance(node, other) >= tree.mean_distance(other, other) for other in others
-        )
-        if apart and tree.silhouettes(np.array([*others, node]))[-1] >= _CLEAR_SILHOUETTE:
-            found.append(node)
-        else:
-            undecided.extend(tree.children_of(node).tolist())
-    return found
 
 
 def _numbered(groups: list[np.ndarray], n: int) -> np.ndarray:

@@ -79,7 +79,6 @@ class ModeControl:
                 self.mode_trials,
                 births=self._exploration_share() > 0,
                 min_return_ratio=self.min_return_ratio,
-                strangers_apart=self.distance_threshold is None and self.max_modes > 1,
             )
             events = self._replace_modes(found)
             found.describe(self._modes, self.replay_buffer)

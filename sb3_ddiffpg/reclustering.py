@@ -6,12 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sb3_ddiffpg.buffers import ModeReplayBuffer
-from sb3_ddiffpg.clustering import Inheritance, assign_to_nearest, match_modes, medoid, strangers
+from sb3_ddiffpg.clustering import Inheritance, assign_to_nearest, match_modes, medoid
 from sb3_ddiffpg.modes import Mode
 from sb3_ddiffpg.trajectories import NO_MODE, Trajectory
-
-# Trajectories that must train a mode before it is told who is a stranger to it: a few alike say little about its spread
-_KNOWN_SPREAD = 10
 
 
 @dataclass(frozen=True)
@@ -64,7 +61,6 @@ def find_modes(
     trials: int,
     births: bool,
     min_return_ratio: float = 0.0,
-    strangers_apart: bool = False,
 ) -> Reclustering:
     """
     :param buffer: Holds the trajectories
@@ -76,8 +72,6 @@ def find_modes(
     :param trials: Commanded episodes in a row that must miss a mode's route before it is given up
     :param births: Whether modes may be born; the first always may
     :param min_return_ratio: Least mean return of a mode, as a share of the best mode's
-    :param strangers_apart: Whether what lies clearly apart from the mode it fell to is kept outside, until there are enough of
-        its kind for a mode of their own
     :return: The new modes
     """
     given_up = _given_up(modes, trials) if buffer.has_success_signal else []
@@ -98,8 +92,6 @@ def find_modes(
     labels = _worth_keeping(modes, returns, old_labels, labels, min_return_ratio, max_modes)
     if modes and not births:
         labels = _without_births(modes, old_labels, labels)
-    if strangers_apart:
-        labels = _without_strangers(successes, distances, labels)
     inheritance = _with_dormant(_match(modes, old_labels, labels), modes, dormant, max_modes)
 
     for mode in modes:
@@ -202,21 +194,6 @@ def _worth_keeping(
     numbers = np.full(_count(labels) + 1, NO_MODE)  # the last for NO_MODE itself
     numbers[stay] = np.arange(len(stay))
     return numbers[labels]
-
-
-def _without_strangers(successes: Sequence[Trajectory], distances: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """
-    Labels in which nobody's trajectories that are strangers to their mode have none: among its many they would be forgotten.
-    Those of a mode's own episodes stay, and what has trained it already.
-    """
-    labels = labels.copy()
-    trains = np.array([trajectory.trains for trajectory in successes], dtype=bool)
-    nobodys = np.array([trajectory.commanded is None for trajectory in successes], dtype=bool)
-    for mode in range(_count(labels)):
-        known, others = np.flatnonzero((labels == mode) & trains), np.flatnonzero((labels == mode) & nobodys & ~trains)
-        if len(known) >= _KNOWN_SPREAD:
-            labels[others[strangers(distances, known, others)]] = NO_MODE
-    return labels
 
 
 def _trajectories(buffer: ModeReplayBuffer, numbers: set[int]) -> tuple[list[Trajectory], list[Trajectory]]:

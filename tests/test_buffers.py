@@ -100,7 +100,7 @@ class PlainBuffer:
                             step["target"] = step["action"]
                     episode["mode"] = mode
                     episode["trains"] = episode in direct[-limit:]
-                retiring += [*direct[:-limit], *detours[: -max(limit, 240 if success and mode == NO_MODE else 0)]]
+                retiring += [*direct[:-limit], *detours[:-limit]]
         self.n_modes = len(parents)
         for episode in sorted(retiring, key=lambda episode: episode["serial"]):
             episode.update(mode=NO_MODE, retired=self.n_retired)

@@ -18,7 +18,6 @@ from sb3_ddiffpg.clustering import (
     match_modes,
     medoid,
     resample_path,
-    strangers,
 )
 
 # Ways through mazes of 4 m cells: round one block, two goals, two goals with several ways to each.
@@ -193,41 +192,6 @@ def test_matrices_that_hold_no_distances():
             cluster(distances, 1.0)
 
 
-# --- strangers ------------------------------------------------------------------------------------------------------
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(2, 12), st.integers(1, 5), st.floats(0.0, 3.0), st.integers(0, 2**16))
-def test_strangers_are_as_far_as_another_mode(n, n_others, shift, seed):
-    """Their silhouette beside the members is the textbook's; scikit-learn's is compared with elsewhere."""
-    rng = np.random.default_rng(seed)
-    points = np.concatenate([rng.normal(size=(n, 2)), rng.normal(size=(n_others, 2)) + shift])
-    distances = np.linalg.norm(points[:, None] - points, axis=-1)
-    members, others = np.arange(n), np.arange(n, n + n_others)
-    within = np.mean([distances[i, j] for i in range(n) for j in range(n) if i != j])
-    expected = []
-    for each in others:
-        apart = np.mean([distances[each, member] for member in members])
-        expected.append((apart - within) / max(apart, within) >= 0.55)
-    assert strangers(distances, members, others).tolist() == expected
-    assert strangers(7 * distances, members, others).tolist() == expected
-    with pytest.raises(ValueError, match="members must be at least 2 trajectories, got 1"):
-        strangers(distances, members[:1], others)
-
-
-@pytest.mark.parametrize("deviation", [0.2, 0.5])
-def test_runs_of_other_routes_are_strangers(deviation):
-    mistaken = []
-    for seed in range(6):
-        for routes in (ONE_BLOCK, TWO_GOALS, FIVE_WAYS):
-            paths, truth = runs(np.random.default_rng(seed), routes, [20] * len(routes), deviation)
-            distances = dtw_distances([resample_path(path, 48) for path in paths])
-            known, later = np.flatnonzero(truth == 0)[:12], np.flatnonzero(truth == 0)[12:]
-            mistaken.extend(strangers(distances, known, later))
-            assert strangers(distances, known, np.flatnonzero(truth != 0)).all()
-    assert np.mean(mistaken) < 0.05
-
-
 # --- the automatic rule --------------------------------------------------------------------------------------------
 
 
@@ -305,15 +269,6 @@ def test_the_first_of_a_rarer_way_are_not_taken_for_the_other(counts, deviation)
             labels = cluster(dtw_distances([resample_path(path, 48) for path in paths]), None, min_size=5)
             often = truth == np.bincount(truth).argmax()
             assert (labels[~often] == -1).all() and (labels[often] == 0).mean() > 0.95
-
-
-def test_a_rare_way_among_several_is_a_mode():
-    """What it adds to a mean over all is less than what the others lose by having it near."""
-    routes = [[(0, 0), (0, 6), (6, 6)], [(0, 0), (0, -6), (6, -6)], [(0, 0), (12, 0)]]
-    for seed in range(4):
-        paths, truth = runs(np.random.default_rng(seed), routes, [200, 200, 16], 0.8)
-        labels = cluster(dtw_distances([resample_path(path, 24) for path in paths]), None)
-        assert same_partition(labels, truth)
 
 
 def test_wanderers_are_neither_a_mode_nor_in_the_way():

@@ -449,12 +449,12 @@ def test_max_modes():
 
 @pytest.mark.slow
 def test_thousands_of_successes():
-    """Five thousand at once, of two routes and a third that few took: who owns which is right, and nothing is lost."""
+    """Five thousand at once, by three routes: who owns which is right, and nothing is lost."""
     fast = {"n_path_points": 12}
     model = planar_model(
         distance_threshold=None, max_successes_per_mode=3000, buffer_size=100_000, min_mode_size=5, replay_buffer_kwargs=fast
     )
-    counts = {"up": 2900, "down": 2080, "right": 20}
+    counts = {"up": 2700, "down": 2000, "right": 300}
     for route, count in counts.items():
         walk(model, route, count)
     assert said(model) == ["mode_0 born", "mode_1 born", "mode_2 born"]
@@ -507,35 +507,6 @@ def test_a_route_that_was_found_against_orders_is_a_mode(two_routes):
     fill(buffer, [np.linspace((0, 0), (-6, 6), 7, dtype=np.float32)])  # an outlier
     assert said(model) == [] and strayed.foreign
     assert [trajectory for trajectory in buffer.trajectories(False) if trajectory.foreign] == [strayed]
-
-
-def test_strangers_wait_outside_of_a_mode_until_there_are_enough(monkeypatch):
-    """
-    A rule that sees one cluster gives the first of a rarer way to the mode that there is. They are kept outside, where they
-    are new to explorers, and outlive its own; what the mode was told to do is its own, however it went.
-    """
-    model = planar_model(min_mode_size=3, distance_threshold=None)
-    buffer = model.replay_buffer
-    walk(model, "up", 12)
-    assert said(model) == ["mode_0 born"]
-    monkeypatch.setattr("sb3_ddiffpg.mode_control.cluster", lambda distances, *args: np.zeros(len(distances), dtype=int))
-    walk(model, "down", 2)
-    rare, clumsy = buffer.trajectories(True)[-2:]
-    clumsy.commanded = model.modes["mode_0"].number
-    for _ in range(3):
-        walk(model, "up", model.max_successes_per_mode)
-        assert said(model) == []
-    assert rare.mode == NO_MODE and buffer.way_novelty[rare.rows[-1]] == 1 and rare in buffer.trajectories(True)
-    assert clumsy not in buffer.trajectories(True) or clumsy.mode == 0
-    monkeypatch.undo()
-    walk(model, "down", 2)
-    assert said(model) == ["mode_1 born"] and rare.mode == 1
-    # With a threshold of one's own, as in the paper, nobody is kept outside
-    model = planar_model(min_mode_size=3, distance_threshold=100.0)
-    walk(model, "up", 12)
-    assert said(model) == ["mode_0 born"]
-    walk(model, "down", 1)
-    assert said(model) == [] and model.replay_buffer.trajectories(True)[-1].mode == 0
 
 
 def test_what_was_foreign_to_a_mode_that_has_ended(two_routes):
