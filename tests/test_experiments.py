@@ -170,30 +170,16 @@ def test_a_trial_ends_with_the_process_that_started_it(tmp_path):
     assert list((tmp_path / "logs" / "checkpoints").glob("*.safetensors"))
 
 
-def test_settings_are_looked_at_again_under_the_lock(tmp_path):
+def test_settings_are_looked_at_again_under_the_lock(monkeypatch, tmp_path):
     """Two processes want one folder: the one that waited must not take the other's training for its own."""
-    (tmp_path / "logs").mkdir()
-    command = [
-        sys.executable,
-        "-m",
-        "sb3_ddiffpg.experiments",
-        "trial",
-        "--env",
-        "PointMazeV1-v0",
-        "--tests",
-        TESTS,
-        "--override",
-        SMALL,
-        "--out",
-        str(tmp_path),
-    ]
-    started = time.monotonic()
-    assert subprocess.run([*command, "--seed", "-1"], capture_output=True).returncode == 2
-    looked = time.monotonic() - started
-    with FileLock(tmp_path / "logs" / "lock"):
-        process = subprocess.Popen([*command, "--seed", "1"], stderr=subprocess.PIPE, text=True)
-        time.sleep(2 * looked)  # it has looked, and waits
-        assert process.poll() is None
-        record = {"algo": "ddiffpg", "env": "PointMazeV1-v0", "seed": 0, "hyperparams": {}, "result": {"complete": True}}
-        (tmp_path / "config.yml").write_text(yaml.safe_dump(record))
-    assert "holds another training" in process.communicate(timeout=60)[1] and process.returncode == 1
+
+    class LateLock(FileLock):
+        def __enter__(self):
+            record = {"algo": "ddiffpg", "env": "PointMazeV1-v0", "seed": 0, "hyperparams": {}, "result": {"complete": True}}
+            (tmp_path / "config.yml").write_text(yaml.safe_dump(record))
+            return super().__enter__()
+
+    monkeypatch.setattr("sb3_ddiffpg.experiments.trial.FileLock", LateLock)
+    with pytest.raises(ValueError, match="holds another training"):
+        record(monkeypatch, tmp_path, "--env", "PointMazeV1-v0", "--seed", "1", "--override", SMALL)
+    assert not (tmp_path / "model.zip").exists()
