@@ -26,8 +26,8 @@ def draw(env_id: str) -> Figure:
     curves = [pd.read_csv(run / "curve.csv") for run in runs]
     taken = [way for way in env.get_attr("listed_modes")[0] if any(curve[way].any() for curve in curves)]
     for number, (run, curve) in enumerate(zip(runs, curves, strict=True)):
-        for way in taken:
-            style = {"color": f"C{taken.index(way)}", "ls": ["-", "--", ":"][number % 3], "label": f"{way}, {run.name}"}
+        for color, way in enumerate(taken):
+            style = {"color": f"C{color}", "ls": ["-", "--", ":"][number % 3], "label": f"{way}, {run.name}"}
             steps.plot(curve["step"], curve[way], **style)
             hours.plot(curve["hours"], curve[way], **style)
     steps.set(xlabel="environment steps", ylabel=f"success of {N_EPISODES}, best command")
@@ -36,6 +36,7 @@ def draw(env_id: str) -> Figure:
     steps.legend(fontsize=8)
 
     model = DDiffPG.load(runs[0] / "model.zip")
+    model.set_random_seed(0)
     episodes = {name: run_episodes(model, env, N_EPISODES, mode=name) for name in model.modes.names}
     plots.draw_routes(routes, episodes, env.get_attr("maze")[0], plots.colors_of(list(model.modes)))
     routes.set_title(f"{runs[0].name}: routes of {N_EPISODES} episodes each")
