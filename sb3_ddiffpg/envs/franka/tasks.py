@@ -98,10 +98,12 @@ class FrankaPegInHole(FrankaEnv):
 class FrankaDrawerClose(FrankaEnv):
     """
     Close one of four open drawers. The mode is the drawer: ``"left-up"``, ``"left-down"``, ``"right-up"`` or ``"right-down"``
-    (left: positive y). The four openings (m) are observed.
+    (left: positive y). The four openings (m) are observed, and are where ways differ: any part of the arm may push a drawer.
     """
 
     listed_modes = QUARTERS
+    features = (6, 7, 8, 9)
+    cell_size = 0.01
     base_x = -1.2
     start_angles = (0.0, -1.5, 0.0, -3.0, 0.0, 2.26, 0.79)
     default_start_noise = 0.1
