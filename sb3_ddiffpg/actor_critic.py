@@ -189,6 +189,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         self.visits: VisitMap | None = None
         self.env_spec: str | None = None
         self._resolved_features: Any = None
+        self._novelty_cell_size = VisitCounts.default_cell_size
         self._warned_support = self._warned_cut_values = False
 
         if _init_setup_model:
@@ -215,11 +216,16 @@ class NoveltyActorCritic(SavableAlgorithm):
     def _visit_cell_size(self) -> float:
         """Edge of the cells by which places are told apart."""
         if self.novelty == "counts":
-            cell_size = (self.novelty_kwargs or {}).get("cell_size", VisitCounts.default_cell_size)
+            cell_size = self._novelty_arguments()["cell_size"]
             if not cell_size > 0:
                 raise ValueError(f"novelty_kwargs['cell_size'] must be positive, got {cell_size}")
             return float(cell_size)
         return declared_cell_size(self.env)
+
+    def _novelty_arguments(self) -> dict[str, Any]:
+        """Of the novelty measure: the environment says how far apart places are, unless the user does."""
+        declared = {"cell_size": self._novelty_cell_size} if self.novelty == "counts" else {}
+        return {**declared, **(self.novelty_kwargs or {})}
 
     def _check_arguments(self) -> None:
         check_arguments(self, self._policy_arguments)
@@ -229,6 +235,8 @@ class NoveltyActorCritic(SavableAlgorithm):
         if self.replay_buffer_class is None:
             self.replay_buffer_class = self.default_replay_buffer_class
         self._resolve_mode_features()
+        if self.env is not None:
+            self._novelty_cell_size = declared_cell_size(self.env, "novelty_cell_size")
         given = self.policy_kwargs, self.replay_buffer_kwargs, self.n_steps
         # Not stored in the model: what the user gave is what ``load`` compares and ``save`` keeps
         self.policy_kwargs = {**self._policy_arguments(), **self.policy_kwargs}
@@ -253,7 +261,7 @@ class NoveltyActorCritic(SavableAlgorithm):
             self.is_normalized = self._vec_normalize_env is not None
         measure = NOVELTY_MEASURES[self.novelty] if isinstance(self.novelty, str) else self.novelty
         self.novelty_model: Any = measure(
-            self.replay_buffer.features.dim, self.policy.actor.features_dim, **(self.novelty_kwargs or {})
+            self.replay_buffer.features.dim, self.policy.actor.features_dim, **self._novelty_arguments()
         ).to(self.device)
         self.intrinsic_moments = RunningMoments(1, max_count=100_000).to(self.device)
         self._qf_schedule = self.lr_schedule if self.qf_learning_rate is None else FloatSchedule(self.qf_learning_rate)

@@ -71,13 +71,14 @@ def declared_mode_features(env: VecEnv) -> Any:
     )
 
 
-def declared_cell_size(env: VecEnv | None) -> float:
+def declared_cell_size(env: VecEnv | None, name: str = "cell_size") -> float:
     """
     :param env: The environments
-    :return: The edge of the cells in which visits are counted: their ``cell_size``, else 0.5
+    :param name: What to ask for: ``"cell_size"`` of the map of visits, or ``"novelty_cell_size"`` of novelty by visit counts
+    :return: The edge of a cell that they declare, else 0.5
     """
-    declared = env is not None and env.has_attr("cell_size")
-    return float(env.get_attr("cell_size", indices=0)[0]) if declared else 0.5  # type: ignore[union-attr]
+    declared = env is not None and env.has_attr(name)
+    return float(env.get_attr(name, indices=0)[0]) if declared else 0.5  # type: ignore[union-attr]
 
 
 def describe_env(env: VecEnv) -> str | None:

@@ -48,6 +48,22 @@ def test_cells_are_those_of_the_environment():
     assert small_model("MountainCarContinuous-v0").visits.dim == 2
 
 
+class Tiny(TwoEnds):
+    novelty_cell_size = 0.02
+
+
+def test_novelty_counts_in_the_cells_that_the_environment_declares(tmp_path):
+    model = small_model(DummyVecEnv([Tiny]))
+    assert model.novelty_model.cell_size == model.replay_buffer.visit_cell_size == model.known_places.cell_size == 0.02
+    assert small_model(DummyVecEnv([Tiny]), novelty_kwargs={"cell_size": 0.3}).novelty_model.cell_size == 0.3
+    assert small_model(DummyVecEnv([TwoEnds])).novelty_model.cell_size == 0.5
+    # Also where there is no environment that says it
+    model.save(tmp_path / "model")
+    model.export(tmp_path / "model.safetensors")
+    for loaded in (DDiffPG.load(tmp_path / "model"), DDiffPG.load(tmp_path / "model.safetensors", safe=True)):
+        assert loaded.novelty_model.cell_size == 0.02
+
+
 @pytest.mark.parametrize(
     ("dim", "cell_size", "message"), [(4, 1.0, "dim must be 1 to 3, got 4"), (2, 0.0, "cell_size must be")]
 )
