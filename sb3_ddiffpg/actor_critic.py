@@ -68,7 +68,8 @@ class NoveltyActorCritic(SavableAlgorithm):
     :param mode_features: See ``DDiffPG``; here novelty is measured in them
     :param success_key: Key of ``info`` that marks a success, see ``ModeReplayBuffer``
     :param novelty: ``"rnd"``, ``"counts"``, or a class with the methods of ``RandomNetworkDistillation``
-    :param novelty_kwargs: Further keyword arguments of the novelty measure
+    :param novelty_kwargs: Further keyword arguments of the novelty measure; the ``cell_size`` of ``"counts"`` is by default what the
+        environment declares as ``novelty_cell_size``, else 0.5
     :param novelty_scale: The factor alpha of NovelD
     :param intrinsic_coef: Factor c on the intrinsic reward
     :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation
@@ -189,7 +190,8 @@ class NoveltyActorCritic(SavableAlgorithm):
         self.visits: VisitMap | None = None
         self.env_spec: str | None = None
         self._resolved_features: Any = None
-        self._novelty_cell_size = VisitCounts.default_cell_size
+        #: What the environment declared when the model was made; the counts are in these cells
+        self._novelty_cell_size: float | None = None
         self._warned_support = self._warned_cut_values = False
 
         if _init_setup_model:
@@ -224,7 +226,7 @@ class NoveltyActorCritic(SavableAlgorithm):
 
     def _novelty_arguments(self) -> dict[str, Any]:
         """Of the novelty measure: the environment says how far apart places are, unless the user does."""
-        declared = {"cell_size": self._novelty_cell_size} if self.novelty == "counts" else {}
+        declared = {"cell_size": self._novelty_cell_size or VisitCounts.default_cell_size} if self.novelty == "counts" else {}
         return {**declared, **(self.novelty_kwargs or {})}
 
     def _check_arguments(self) -> None:
@@ -235,7 +237,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         if self.replay_buffer_class is None:
             self.replay_buffer_class = self.default_replay_buffer_class
         self._resolve_mode_features()
-        if self.env is not None:
+        if self._novelty_cell_size is None and self.mode_features is None:
             self._novelty_cell_size = declared_cell_size(self.env, "novelty_cell_size")
         given = self.policy_kwargs, self.replay_buffer_kwargs, self.n_steps
         # Not stored in the model: what the user gave is what ``load`` compares and ``save`` keeps
@@ -254,8 +256,9 @@ class NoveltyActorCritic(SavableAlgorithm):
             self.action_noise = SpreadNormalActionNoise(self.n_envs, action_dim, **deviations)
         elif type(noise) is VectorizedActionNoise and noise.n_envs != self.n_envs:
             self.action_noise = VectorizedActionNoise(noise.base_noise, self.n_envs)
-        if self.visits is None and self.replay_buffer.features.dim <= 3:
-            self.visits = VisitMap(self.replay_buffer.features.dim, declared_cell_size(self.env))
+        dim = self.replay_buffer.features.dim
+        if self.visits is None or self.visits.dim != dim:
+            self.visits = VisitMap(dim, declared_cell_size(self.env)) if dim <= 3 else None
         if self.env is not None:
             self.env_spec = describe_env(self.env)
             self.is_normalized = self._vec_normalize_env is not None

@@ -56,7 +56,6 @@ class _Buffer(msgspec.Struct, forbid_unknown_fields=True):
     feature_scale: np.ndarray | None
     last_positions: np.ndarray
     serials: np.ndarray
-    compared_lengths: np.ndarray
     distances: np.ndarray
 
 
@@ -116,7 +115,6 @@ def buffer_state(buffer: ModeReplayBuffer) -> dict[str, Any] | None:
         "feature_scale": buffer._feature_scale,
         "last_positions": buffer._last_positions,
         "serials": buffer._distances.serials,
-        "compared_lengths": buffer._distances.lengths,
         "distances": buffer._distances.distances,
     }
 
@@ -162,8 +160,7 @@ def restore_buffer(buffer: ModeReplayBuffer, tree: Any) -> None:
     buffer._success_rule.recent_returns.extend(state.recent_returns)
     buffer.owner = state.owner
     buffer._feature_scale, buffer._last_positions = state.feature_scale, state.last_positions
-    known = buffer._distances
-    known.serials, known.lengths, known.distances = state.serials, state.compared_lengths, state.distances
+    buffer._distances.serials, buffer._distances.distances = state.serials, state.distances
     buffer.recall_places()
 
 
@@ -247,7 +244,6 @@ def _check_arrays(buffer: ModeReplayBuffer, state: _Buffer) -> None:
         ("retired", state.retired, np.int64, [None]),
         ("last_positions", state.last_positions, np.float32, [buffer.n_envs, buffer.features.dim]),
         ("serials", state.serials, np.int64, [None]),
-        ("compared_lengths", state.compared_lengths, np.float64, [n_known]),
         ("distances", state.distances, np.float32, [n_known, n_known]),
         *((f"mode_rows[{i}]", rows, np.int32, [None]) for i, rows in enumerate(state.mode_rows)),
         *((f"groups[{i}]", group.members, np.int64, [None]) for i, group in enumerate(state.groups)),

@@ -10,9 +10,9 @@ from scipy.spatial.distance import cdist
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
+from sb3_ddiffpg.dtw import erase_loops, resample_path
 from sb3_ddiffpg.features import ModeFeatures
 from sb3_ddiffpg.intrinsic import cell_entries
-from sb3_ddiffpg.paths import comparable_ends, erase_loops, resample_path
 from sb3_ddiffpg.row_storage import Fields
 from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, Trajectory
 from sb3_ddiffpg.trajectory_buffer import TrajectoryReplayBuffer
@@ -45,8 +45,7 @@ class ModeBatch(NamedTuple):
 
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
-    *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct", "max_path_ratio"),
-    *("loop_share", "route_share"),
+    *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct", "loop_share", "route_share"),
     *("new_way_share", "explore_beyond_goals", "visit_cell_size"),
 )
 
@@ -74,8 +73,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     :param n_path_points: Points to which a trajectory's path is resampled for clustering
     :param normalize_distances: Whether DTW distances are divided by the square root of the path's length, which makes them
         about the mean distance along the way; False for the root of the summed squares, to which the paper's thresholds refer
-    :param max_path_ratio: Of a path longer than this times the shortest known to be possible, only the end, so long, is
-        compared with others, see ``comparable_ends``
     :param loop_share: Radius within which a path that comes back has made a loop, as a share of the path's extent
     :param route_share: Distance beyond which a step is off a mode's route, as a share of the route's extent
     :param new_way_share: Share of the exploratory group's rows that are drawn from trajectories which reached a goal by a way
@@ -111,7 +108,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         min_direct: int = 5,
         n_path_points: int = 48,
         normalize_distances: bool = True,
-        max_path_ratio: float = 1.5,
         loop_share: float = 0.05,
         route_share: float = 0.1,
         new_way_share: float = 0.0,
@@ -124,7 +120,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             ("max_length_ratio", max_length_ratio, 1),
             ("min_direct", min_direct, 1),
             ("n_path_points", n_path_points, 2),
-            ("max_path_ratio", max_path_ratio, 1),
             ("loop_share", loop_share, 0),
             ("route_share", route_share, 0),
             ("new_way_share", new_way_share, 0),
@@ -138,7 +133,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.min_direct = min_direct
         self.n_path_points = n_path_points
         self.normalize_distances = normalize_distances
-        self.max_path_ratio = max_path_ratio
         self.loop_share = loop_share
         self.route_share = route_share
         self.new_way_share = new_way_share
@@ -341,15 +335,13 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
 
     def success_distances(self, successes: list[Trajectory]) -> np.ndarray:
         """
-        Pairwise DTW distances of what can be compared of their paths. Only pairs with a trajectory that was not there the last
-        time, or of which another part is compared now, are computed.
+        Pairwise DTW distances. Only pairs with a trajectory that was not there the last time are computed.
 
         :param successes: The trajectories to compare, in order of finishing
         :return: Shape [N, N]
         """
         serials = np.array([trajectory.serial for trajectory in successes], dtype=np.int64)
-        paths = [self.path(trajectory) for trajectory in successes]
-        return self._distances(serials, *comparable_ends(paths, self.max_path_ratio))
+        return self._distances(serials, [self.path(trajectory) for trajectory in successes])
 
     def assign_modes(
         self,

@@ -11,8 +11,7 @@ from scipy.cluster import hierarchy
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import squareform
 
-from sb3_ddiffpg.dtw import dtw_distances
-from sb3_ddiffpg.paths import resample_path
+from sb3_ddiffpg.dtw import dtw_distances, resample_path
 
 __all__ = [
     "LINKAGES",

@@ -1,11 +1,10 @@
-"""Dynamic time warping between many trajectories at once."""
+"""Dynamic time warping between many trajectories at once, and resampling of one trajectory by arc length."""
 
 from collections.abc import Sequence
 
 import numba
 import numpy as np
-
-from sb3_ddiffpg.paths import check_path
+from scipy.spatial.distance import cdist
 
 # Pairs that share one pass of the recursion: one path against this many others, side by side in the vector registers.
 # Measured against 32 and 64: as fast on short paths, faster on long ones (the rows stay in cache), and fewer idle lanes.
@@ -13,6 +12,44 @@ LANES = 16
 
 # Infinity marks the border of the warping table, so "ninf" must stay out; inputs are checked, so there is no NaN to keep.
 _FLOAT_FLAGS = {"contract", "nnan", "nsz"}
+
+
+def erase_loops(path: np.ndarray, radius: float) -> np.ndarray:
+    """
+    The path without its loops: from each point it goes on where the path was last within ``radius`` of that point. Wandering
+    on the way says nothing about the way.
+
+    :param path: shape ``[length, dims]``
+    :param radius: in the unit of the path
+    :return: shape ``[at most length, dims]``; begins and ends as the path does
+    """
+    last_near = len(path) - 1 - (cdist(path, path) <= radius)[:, ::-1].argmax(axis=1)
+    kept = [0]
+    while kept[-1] < len(path) - 1:
+        current = kept[-1]
+        kept.append(int(max(last_near[current], current + 1)))
+    return path[kept]
+
+
+def resample_path(path: np.ndarray, n_points: int) -> np.ndarray:
+    """
+    Points at equal distances of arc length along the polyline through ``path``: what is left of a trajectory when
+    its speed, its pauses and its number of steps are forgotten. The first and last points are kept.
+
+    :param path: points in the order they were visited, shape ``[length, dims]``, length at least 1
+    :param n_points: number of points returned, at least 1 (a single one is the first point)
+    :return: float32 array of shape ``[n_points, dims]``; a path that never moves gives copies of its first point
+    :raises ValueError: if ``path`` is not of that shape or not finite, or ``n_points`` is less than 1
+    """
+    if n_points < 1:
+        raise ValueError(f"n_points must be at least 1, got {n_points}")
+    points = np.asarray(_check_path(path, "path"), dtype=np.float64)
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    targets = np.linspace(0.0, travelled[-1], n_points)
+    # A repeated point is a segment of length zero; np.interp wants increasing abscissae, so each stays once.
+    moved = np.concatenate([[True], np.diff(travelled) > 0.0])
+    columns = [np.interp(targets, travelled[moved], column) for column in points[moved].T]
+    return np.stack(columns, axis=1).astype(np.float32)
 
 
 def dtw_distances(
@@ -115,8 +152,19 @@ def _lengths(paths: list[np.ndarray]) -> np.ndarray:
     return np.array([len(path) for path in paths], dtype=np.int64)
 
 
+def _check_path(path: np.ndarray, name: str) -> np.ndarray:
+    points = np.asarray(path)
+    if points.ndim != 2 or 0 in points.shape:
+        raise ValueError(f"{name} must have shape [length, dims] with at least one point, got shape {points.shape}")
+    with np.errstate(over="ignore"):
+        finite = np.isfinite(points.astype(np.float32)).all()
+    if not finite:
+        raise ValueError(f"{name} holds values that are NaN, infinite or too large for float32")
+    return points
+
+
 def _check_paths(paths: Sequence[np.ndarray], name: str) -> list[np.ndarray]:
-    checked = [check_path(path, f"{name}[{index}]").astype(np.float32) for index, path in enumerate(paths)]
+    checked = [_check_path(path, f"{name}[{index}]").astype(np.float32) for index, path in enumerate(paths)]
     for index, path in enumerate(checked):
         if path.shape[1] != checked[0].shape[1]:
             raise ValueError(f"{name}[{index}] has {path.shape[1]} dims where {name}[0] has {checked[0].shape[1]}")

@@ -16,10 +16,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.clustering import cluster
-from sb3_ddiffpg.dtw import dtw_distances
+from sb3_ddiffpg.dtw import dtw_distances, erase_loops, resample_path
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.episodes import EpisodeResult, run_episodes
-from sb3_ddiffpg.paths import comparable_ends, erase_loops, resample_path
 from sb3_ddiffpg.rng import preserved_rng
 from sb3_ddiffpg.safe_files import convert
 from sb3_ddiffpg.trajectories import NO_MODE
@@ -393,7 +392,7 @@ def _labels(model: Any, runs: list[list[EpisodeResult]]) -> tuple[list[list[str 
     # As the model finds them, where it does
     buffer = getattr(model, "replay_buffer", None)
     if isinstance(buffer, ModeReplayBuffer) and (buffer.size() or not buffer.features.whole_observation):
-        paths, ratio = [buffer.resample(episode.path) for episode in successes], buffer.max_path_ratio
+        paths = [buffer.resample(episode.path) for episode in successes]
         normalize, linkage = buffer.normalize_distances, getattr(model, "linkage", "average")
     else:
         full = [episode.path for episode in successes]
@@ -401,10 +400,9 @@ def _labels(model: Any, runs: list[list[EpisodeResult]]) -> tuple[list[list[str 
             scale = np.maximum(np.concatenate(full).std(axis=0), 1e-6)
             full = [path / scale for path in full]
         short = [erase_loops(path, 0.05 * float(np.linalg.norm(np.ptp(path, axis=0)))) for path in full]
-        paths, ratio, normalize, linkage = [resample_path(path, 48) for path in short], 1.5, True, "average"
+        paths, normalize, linkage = [resample_path(path, 48) for path in short], True, "average"
     threshold, min_size = getattr(model, "distance_threshold", None), 1 if len(paths) < 3 else 3
-    distances = dtw_distances(comparable_ends(paths, ratio)[1], normalize=normalize)
-    numbers = iter(cluster(distances, threshold, linkage, min_size=min_size))
+    numbers = iter(cluster(dtw_distances(paths, normalize=normalize), threshold, linkage, min_size=min_size))
     names = [[_cluster_name(next(numbers)) if _reached(episode) else None for episode in run] for run in runs]
     return names, "clustering"
 

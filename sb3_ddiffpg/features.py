@@ -76,9 +76,18 @@ def declared_cell_size(env: VecEnv | None, name: str = "cell_size") -> float:
     :param env: The environments
     :param name: What to ask for: ``"cell_size"`` of the map of visits, or ``"novelty_cell_size"`` of novelty by visit counts
     :return: The edge of a cell that they declare, else 0.5
+    :raises ValueError: If they declare something else
     """
-    declared = env is not None and env.has_attr(name)
-    return float(env.get_attr(name, indices=0)[0]) if declared else 0.5  # type: ignore[union-attr]
+    if env is None or not env.has_attr(name):
+        return 0.5
+    declared: Any = env.get_attr(name, indices=0)[0]
+    try:
+        size = float(declared)
+    except (TypeError, ValueError):
+        size = float("nan")
+    if not 0 < size < float("inf"):
+        raise ValueError(f"The environment declares {name}={declared!r}: it must be a positive number")
+    return size
 
 
 def describe_env(env: VecEnv) -> str | None:

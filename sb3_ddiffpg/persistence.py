@@ -32,7 +32,7 @@ class SavableAlgorithm(OffPolicyAlgorithm):
 
     visits: VisitMap | None
     _resolved_features: Any
-    _novelty_cell_size: float
+    _novelty_cell_size: float | None
     _interrupted: InterruptedRun | None = None
     _learn_began_at = 0  # in environment steps; SB3's ``_num_timesteps_at_start`` moves when a run is resumed
     run_id: str
@@ -196,7 +196,7 @@ class SavableAlgorithm(OffPolicyAlgorithm):
             setattr(self, name, convert(counters[name], kind, f"model.state.counters.{name}"))
         with contextlib.suppress(NeededError):  # then the constructor's argument says it
             self._resolved_features = from_plain(tree.get("mode_features"))
-        self._novelty_cell_size = convert(tree.get("novelty_cell_size", 0.5), float, "model.state.novelty_cell_size")
+        self._novelty_cell_size = convert(tree.get("novelty_cell_size"), float | None, "model.state.novelty_cell_size")
         visits = tree.get("visits")
         self.visits = None if visits is None else VisitMap.from_state(visits)
 

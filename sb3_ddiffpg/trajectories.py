@@ -151,18 +151,15 @@ class DistanceCache:
     def __init__(self, normalize: bool = True) -> None:
         self.normalize = normalize
         self.serials = np.zeros(0, dtype=np.int64)
-        self.lengths = np.zeros(0)
         self.distances = np.zeros((0, 0), dtype=np.float32)
 
-    def __call__(self, serials: np.ndarray, lengths: np.ndarray, paths: list[np.ndarray]) -> np.ndarray:
+    def __call__(self, serials: np.ndarray, paths: list[np.ndarray]) -> np.ndarray:
         """
-        :param serials: Ascending numbers that identify the trajectories, shape [N]
-        :param lengths: Arc length of the part of each that is compared, shape [N]: another one is another path
+        :param serials: Ascending numbers that identify the paths, shape [N]
         :param paths: Each [n_path_points, dim]
         :return: Shape [N, N]
         """
         known = np.isin(serials, self.serials)
-        known[known] = self.lengths[np.searchsorted(self.serials, serials[known])] == lengths[known]
         old = np.searchsorted(self.serials, serials[known])
         distances = np.zeros((len(serials), len(serials)), dtype=np.float32)
         distances[np.ix_(known, known)] = self.distances[np.ix_(old, old)]
@@ -174,5 +171,5 @@ class DistanceCache:
                 across = dtw_distances(new, seen, self.normalize)
                 distances[np.ix_(~known, known)] = across
                 distances[np.ix_(known, ~known)] = across.T
-        self.serials, self.lengths, self.distances = serials, lengths, distances
+        self.serials, self.distances = serials, distances
         return distances

@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_ddiffpg.buffer_state import buffer_state, restore_buffer
 from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.dtw import dtw_distances
-from sb3_ddiffpg.paths import comparable_ends
 from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, SuccessRule
 
 OBSERVATION, ACTION = spaces.Box(-np.inf, np.inf, (2,)), spaces.Box(-1.0, 1.0, (2,))
@@ -352,7 +351,7 @@ def test_distances_of_the_cache_are_fresh_ones():
     paths = [rng.normal(size=(12, 2)).astype(np.float32) for _ in range(20)]
     cache = DistanceCache()
     for kept in ([0, 1, 2], [1, 2, 5, 7], [7], [], [3, 7, 9, 11, 19], [3, 7, 9, 11, 19]):
-        distances = cache(np.array(kept, dtype=np.int64), np.full(len(kept), np.inf), [paths[i] for i in kept])
+        distances = cache(np.array(kept, dtype=np.int64), [paths[i] for i in kept])
         np.testing.assert_allclose(distances, dtw_distances([paths[i] for i in kept]) if kept else np.zeros((0, 0)), rtol=1e-6)
 
 
@@ -370,8 +369,7 @@ def test_cached_distances_follow_the_trajectories():
         fill(buffer, [rng.normal(size=(11, 2)).astype(np.float32).cumsum(axis=0)])
         successes = buffer.trajectories(success=True)
         cached = buffer.success_distances(successes)
-        paths = [buffer.resample(buffer.full_path(trajectory)) for trajectory in successes]
-        fresh = dtw_distances(comparable_ends(paths, 1.5)[1])
+        fresh = dtw_distances([buffer.resample(buffer.full_path(trajectory)) for trajectory in successes])
         np.testing.assert_allclose(cached, fresh, rtol=1e-5, atol=1e-6)
     assert [trajectory.serial for trajectory in successes] == [6, 7, 8, 9, 10, 11]
 

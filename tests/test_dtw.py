@@ -1,10 +1,12 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from dtaidistance import dtw_ndim
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_ddiffpg.dtw import LANES, dtw_distances
+from sb3_ddiffpg.dtw import LANES, dtw_distances, erase_loops, resample_path
 
 
 def slow_dtw(a: np.ndarray, b: np.ndarray) -> float:
@@ -113,3 +115,71 @@ def test_wrong_shapes():
         dtw_distances([path, np.zeros((4, 3))])
     with pytest.raises(ValueError, match="must agree"):
         dtw_distances([path], [np.zeros((4, 3))])
+
+
+def test_resampling_a_corner_by_hand():
+    # 3 m along x, then 1 m along y: arc lengths 0, 1, 2, 3, 4.
+    path = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 1.0]])
+    expected = [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [3.0, 1.0]]
+    resampled = resample_path(path, 5)
+    np.testing.assert_allclose(resampled, expected, atol=1e-6)
+    assert resampled.dtype == np.float32
+
+
+def test_resampling_forgets_speed_and_pauses():
+    route = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [-2.0, 4.0]])
+    slow = np.concatenate([np.linspace(a, b, 40) for a, b in pairwise(route)])
+    pausing = np.repeat(slow, np.random.default_rng(0).integers(1, 6, size=len(slow)), axis=0)
+    np.testing.assert_allclose(resample_path(pausing, 33), resample_path(route, 33), atol=1e-5)
+
+
+@settings(max_examples=50, deadline=None)
+@given(length=st.integers(1, 20), dims=st.integers(1, 4), n_points=st.integers(2, 40), seed=st.integers(0, 2**32 - 1))
+def test_resampled_points_keep_the_ends_and_their_spacing(length, dims, n_points, seed):
+    rng = np.random.default_rng(seed)
+    path = np.repeat(rng.normal(size=(length, dims)), rng.integers(1, 4, size=length), axis=0)
+    resampled = resample_path(path, n_points)
+    assert resampled.shape == (n_points, dims)
+    np.testing.assert_allclose(resampled[[0, -1]], path[[0, -1]], rtol=1e-6)
+    # A chord is at most as long as the way between its ends, and most chords lie on one segment.
+    spacing = np.linalg.norm(np.diff(path, axis=0), axis=1).sum() / (n_points - 1)
+    assert np.all(np.linalg.norm(np.diff(resampled, axis=0), axis=1) <= spacing * (1 + 1e-4) + 1e-5)
+
+
+@pytest.mark.parametrize("length", [1, 5])
+def test_resampling_a_path_that_never_moves(length):
+    path = np.full((length, 3), 2.5)
+    np.testing.assert_array_equal(resample_path(path, 4), np.full((4, 3), 2.5, dtype=np.float32))
+
+
+def test_resampling_to_one_point_gives_the_first():
+    np.testing.assert_array_equal(resample_path(np.array([[1.0], [5.0]]), 1), [[1.0]])
+
+
+def test_resampling_checks_its_arguments():
+    with pytest.raises(ValueError, match="n_points must be at least 1, got 0"):
+        resample_path(np.zeros((2, 2)), 0)
+    with pytest.raises(ValueError, match="path must have shape"):
+        resample_path(np.zeros((0, 2)), 3)
+    with pytest.raises(ValueError, match="path holds values"):
+        resample_path(np.array([[0.0, np.nan]]), 3)
+
+
+def test_loops_are_erased_by_hand():
+    # right, a detour up and back, then on to the right
+    path = np.array([[0, 0], [1, 0], [1, 1], [1, 2], [1, 1], [1, 0], [2, 0], [3, 0]], dtype=np.float32)
+    np.testing.assert_array_equal(erase_loops(path, 0.1), [[0, 0], [1, 0], [1, 0], [2, 0], [3, 0]])
+    np.testing.assert_array_equal(erase_loops(path[:4], 0.1), path[:4])
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 10_000), length=st.integers(1, 80), radius=st.floats(0.0, 3.0))
+def test_erased_paths_keep_their_ends_and_come_back_to_no_point(seed, length, radius):
+    path = np.cumsum(np.random.default_rng(seed).normal(size=(length, 2)), axis=0)
+    erased = erase_loops(path, radius)
+    np.testing.assert_array_equal(erased[[0, -1]], path[[0, -1]])
+    steps = [int(np.flatnonzero((path == point).all(axis=1))[0]) for point in erased]
+    assert steps == sorted(set(steps))
+    for i, point in enumerate(erased[:-2]):
+        # what comes after the next point is out of reach of this one
+        assert (np.linalg.norm(erased[i + 2 :] - point, axis=1) > radius).all()

@@ -57,11 +57,23 @@ def test_novelty_counts_in_the_cells_that_the_environment_declares(tmp_path):
     assert model.novelty_model.cell_size == model.replay_buffer.visit_cell_size == model.known_places.cell_size == 0.02
     assert small_model(DummyVecEnv([Tiny]), novelty_kwargs={"cell_size": 0.3}).novelty_model.cell_size == 0.3
     assert small_model(DummyVecEnv([TwoEnds])).novelty_model.cell_size == 0.5
-    # Also where there is no environment that says it
+    # It belongs to the environment's own features, not to yours
+    assert small_model(DummyVecEnv([Tiny]), mode_features=[1]).novelty_model.cell_size == 0.5
+    # Also where there is no environment that says it, or one that says something else: what was counted stays
     model.save(tmp_path / "model")
     model.export(tmp_path / "model.safetensors")
     for loaded in (DDiffPG.load(tmp_path / "model"), DDiffPG.load(tmp_path / "model.safetensors", safe=True)):
         assert loaded.novelty_model.cell_size == 0.02
+    assert DDiffPG.load(tmp_path / "model", env=DummyVecEnv([TwoEnds])).novelty_model.cell_size == 0.02
+
+
+@pytest.mark.parametrize("declared", [0, -1.0, None, "wide", float("inf"), float("nan")])
+def test_cells_that_cannot_be_are_refused_by_the_name_of_who_declared_them(declared):
+    class Odd(TwoEnds):
+        novelty_cell_size = declared
+
+    with pytest.raises(ValueError, match=r"The environment declares novelty_cell_size=.*: it must be a positive number"):
+        small_model(DummyVecEnv([Odd]))
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
     start_angles: ClassVar[tuple[float, ...]]
     default_start_noise: ClassVar[float] = 0.0
     #: Where in the observation ways differ: the fingertips' position
-    features: ClassVar[tuple[int, ...]] = (0, 1, 2)
+    feature_indices: ClassVar[tuple[int, ...]] = (0, 1, 2)
     #: Edge of the cells in which visits are counted, for maps and for novelty, in metres
     cell_size: ClassVar[float] = 0.05
     #: The ways of doing it
@@ -62,7 +62,7 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         self.start_noise = self.default_start_noise if start_noise is None else start_noise
         if not 0 <= self.start_noise <= np.pi:
             raise ValueError(f"start_noise: {start_noise} given; accepted are 0 to pi rad, and None")
-        self.mode_features = np.array(self.features)
+        self.mode_features = np.array(self.feature_indices)
         self.novelty_cell_size = self.cell_size
         size = 6 + self.n_extra + 7 * obs_joints
         self.observation_space = spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)

@@ -102,7 +102,7 @@ class FrankaDrawerClose(FrankaEnv):
     """
 
     listed_modes = QUARTERS
-    features = (6, 7, 8, 9)
+    feature_indices = (6, 7, 8, 9)
     cell_size = 0.01
     base_x = -1.2
     start_angles = (0.0, -1.5, 0.0, -3.0, 0.0, 2.26, 0.79)
