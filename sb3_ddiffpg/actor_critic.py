@@ -68,8 +68,8 @@ class NoveltyActorCritic(SavableAlgorithm):
     :param mode_features: See ``DDiffPG``; here novelty is measured in them
     :param success_key: Key of ``info`` that marks a success, see ``ModeReplayBuffer``
     :param novelty: ``"rnd"``, ``"counts"``, or a class with the methods of ``RandomNetworkDistillation``
-    :param novelty_kwargs: Further keyword arguments of the novelty measure; the ``cell_size`` of ``"counts"`` is by default what the
-        environment declares as ``novelty_cell_size``, else 0.5
+    :param novelty_kwargs: Further keyword arguments of the novelty measure; the ``cell_size`` of ``"counts"`` is what the
+        environment declares as ``novelty_cell_size``, else 0.5, if none is given
     :param novelty_scale: The factor alpha of NovelD
     :param intrinsic_coef: Factor c on the intrinsic reward
     :param normalize_intrinsic: Whether the intrinsic reward is divided by its running standard deviation

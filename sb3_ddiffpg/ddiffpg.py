@@ -108,8 +108,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param explore_beyond_goals: Whether a goal does not end the exploratory critics' returns: novelty is not episodic
         (Burda et al., 2018, section 2.3), and explorers would keep away from where it ends
     :param novelty: ``"rnd"``, ``"counts"``, or a class with the methods of ``RandomNetworkDistillation``
-    :param novelty_kwargs: Further keyword arguments of the novelty measure; the ``cell_size`` of ``"counts"`` is by default what the
-        environment declares as ``novelty_cell_size``, else 0.5
+    :param novelty_kwargs: Further keyword arguments of the novelty measure; the ``cell_size`` of ``"counts"`` is what the
+        environment declares as ``novelty_cell_size``, else 0.5, if none is given
     :param novelty_scale: The factor alpha of NovelD
     :param intrinsic_coef: Factor c on the intrinsic reward
     :param mode_intrinsic_coef: Factor on the intrinsic reward that is added to the modes' rewards
