@@ -1,0 +1,83 @@
+"""Pictures of the recorded runs: success of the commanded ways along training, and in a maze the first run's routes."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from sb3_ddiffpg import DDiffPG, plots
+from sb3_ddiffpg.envs import make_vec_env
+from sb3_ddiffpg.episodes import run_episodes
+
+RESULTS = Path(__file__).parents[2] / "results"
+N_EPISODES = 20
+ANT, ARM = "AntMaze", "Franka"
+
+
+def draw_curves(steps: Axes, hours: Axes, runs: list[Path], ways: tuple[str, ...]) -> None:
+    """
+    :param steps: Gets the success of each way against environment steps
+    :param hours: The same against hours
+    :param runs: Folders of recorded runs
+    :param ways: Those of the environment
+    """
+    curves = [pd.read_csv(run / "curve.csv") for run in runs]
+    taken = [way for way in ways if any(curve[way].any() for curve in curves)]
+    for number, (run, curve) in enumerate(zip(runs, curves, strict=True)):
+        for color, way in enumerate(taken):
+            style = {"color": f"C{color}", "ls": ["-", "--", ":"][number % 3], "label": f"{way}, {run.name}"}
+            steps.plot(curve["step"], curve[way], **style)
+            hours.plot(curve["hours"], curve[way], **style)
+    steps.set(xlabel="environment steps", ylabel=f"success of {N_EPISODES}, best command")
+    steps.xaxis.set_major_formatter(EngFormatter(sep=""))
+    hours.set(xlabel="hours on one busy core")
+    steps.legend(fontsize=8)
+
+
+def draw_ant(env_id: str) -> Figure:
+    """
+    :param env_id: Of an ant maze with recorded runs
+    :return: The picture
+    """
+    figure = Figure(figsize=(14, 4.2), layout="constrained")
+    steps, hours, routes = figure.subplots(1, 3, width_ratios=(3, 3, 3.4))
+    runs = sorted((RESULTS / env_id).iterdir())
+    env = make_vec_env(env_id, N_EPISODES, seed=0, start_noise=0.0, integrator="euler")
+    draw_curves(steps, hours, runs, env.get_attr("listed_modes")[0])
+    model = DDiffPG.load(runs[0] / "model.zip")
+    model.set_random_seed(0)
+    episodes = {name: run_episodes(model, env, N_EPISODES, mode=name) for name in model.modes.names}
+    plots.draw_routes(routes, episodes, env.get_attr("maze")[0], plots.colors_of(list(model.modes)))
+    routes.set_title(f"{runs[0].name}: routes of {N_EPISODES} episodes each")
+    routes.legend(loc="lower left", fontsize=8)
+    return figure
+
+
+def draw_arm(env_ids: list[str]) -> Figure:
+    """
+    :param env_ids: Of arm tasks with recorded runs
+    :return: The picture, a row for each
+    """
+    figure = Figure(figsize=(9.5, 3.2 * len(env_ids)), layout="constrained")
+    for env_id, (steps, hours) in zip(env_ids, np.atleast_2d(figure.subplots(len(env_ids), 2)), strict=True):
+        env = make_vec_env(env_id, 1)
+        draw_curves(steps, hours, sorted((RESULTS / env_id).iterdir()), env.get_attr("listed_modes")[0])
+        env.close()
+        steps.set_title(env_id)
+    return figure
+
+
+def main() -> None:
+    here = Path(__file__).parent
+    for folder in RESULTS.glob(f"{ANT}*-v0"):
+        name = folder.name.removeprefix(ANT).removesuffix("-v0").lower()
+        draw_ant(folder.name).savefig(here / f"ant_{name}_routes.png", dpi=90)
+    arms = sorted(folder.name for folder in RESULTS.glob(f"{ARM}*-v0"))
+    draw_arm(arms).savefig(here / "arm_curves.png", dpi=90)
+
+
+if __name__ == "__main__":
+    main()
