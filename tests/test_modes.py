@@ -413,6 +413,7 @@ def test_statistics_and_representative(two_routes):
 
 
 def test_an_interrupt_waits_until_all_follow_the_clustering(two_routes, monkeypatch):
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job is born without
     model = two_routes
     walk(model, "right", 9)
     inherit = model.policy.inherit

@@ -246,6 +246,6 @@ def test_franka_in_workers():
             np.testing.assert_array_equal(part, other)
     assert ours.render_mode is None and make_vec_env("FrankaReach-v0").render_mode is None
     assert ours.get_attr("spec", 0)[0].id == "FrankaDrawerClose-v0"
-    assert ours.get_attr("mode_features", 2)[0].tolist() == [0, 1, 2]
+    assert ours.get_attr("mode_features", 2)[0].tolist() == [6, 7, 8, 9]
     ours.close()
     single.close()
