@@ -18,7 +18,7 @@ gym.register_envs(gymnasium_robotics)
 @pytest.mark.parametrize("length", [1, pytest.param(20, marks=pytest.mark.slow)])
 def test_learns_the_identity(length):
     """The action that equals the observation is rewarded, in episodes of one step or more; there is nothing to cluster."""
-    env = make_vec_env(lambda: IdentityEnvBox(eps=0.3, ep_length=length), 4)
+    env = make_vec_env(lambda: IdentityEnvBox(eps=0.3, ep_length=length), 4, seed=0)
     model = small_model(
         env,
         learning_starts=200,
@@ -33,7 +33,7 @@ def test_learns_the_identity(length):
         gamma=0.0,
         v_max=1.0,
     )
-    evaluation = IdentityEnvBox(eps=0.3, ep_length=length)
+    evaluation = make_vec_env(lambda: IdentityEnvBox(eps=0.3, ep_length=length), 1, seed=1)
 
     def success():
         return evaluate_policy(model, evaluation, n_eval_episodes=200 // length, warn=False)[0] / length
