@@ -57,6 +57,7 @@ class _Buffer(msgspec.Struct, forbid_unknown_fields=True):
     last_positions: np.ndarray
     serials: np.ndarray
     distances: np.ndarray
+    compared_length: float | None = None
 
 
 # Columns of ``_Trajectories`` that have one number for each
@@ -116,6 +117,7 @@ def buffer_state(buffer: ModeReplayBuffer) -> dict[str, Any] | None:
         "last_positions": buffer._last_positions,
         "serials": buffer._distances.serials,
         "distances": buffer._distances.distances,
+        "compared_length": buffer.compared_length,
     }
 
 
@@ -160,7 +162,8 @@ def restore_buffer(buffer: ModeReplayBuffer, tree: Any) -> None:
     buffer._success_rule.recent_returns.extend(state.recent_returns)
     buffer.owner = state.owner
     buffer._feature_scale, buffer._last_positions = state.feature_scale, state.last_positions
-    buffer._distances.serials, buffer._distances.distances = state.serials, state.distances
+    if state.compared_length == buffer.compared_length:  # else they are other paths' distances
+        buffer._distances.serials, buffer._distances.distances = state.serials, state.distances
     buffer.recall_places()
 
 

@@ -45,7 +45,8 @@ class ModeBatch(NamedTuple):
 
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
-    *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct", "loop_share", "route_share"),
+    *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct"),
+    *("compared_length", "loop_share", "route_share"),
     *("new_way_share", "explore_beyond_goals", "visit_cell_size"),
 )
 
@@ -73,6 +74,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     :param n_path_points: Points to which a trajectory's path is resampled for clustering
     :param normalize_distances: Whether DTW distances are divided by the square root of the path's length, which makes them
         about the mean distance along the way; False for the root of the summed squares, to which the paper's thresholds refer
+    :param compared_length: How much of a path's end is compared, in the unit of the mode features; None: all of it. What an
+        explorer did before it took a way says nothing about the way
     :param loop_share: Radius within which a path that comes back has made a loop, as a share of the path's extent
     :param route_share: Distance beyond which a step is off a mode's route, as a share of the route's extent
     :param new_way_share: Share of the exploratory group's rows that are drawn from trajectories which reached a goal by a way
@@ -108,6 +111,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         min_direct: int = 5,
         n_path_points: int = 48,
         normalize_distances: bool = True,
+        compared_length: float | None = None,
         loop_share: float = 0.05,
         route_share: float = 0.1,
         new_way_share: float = 0.0,
@@ -133,13 +137,16 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.min_direct = min_direct
         self.n_path_points = n_path_points
         self.normalize_distances = normalize_distances
+        self.compared_length = compared_length
         self.loop_share = loop_share
         self.route_share = route_share
         self.new_way_share = new_way_share
         self.explore_beyond_goals = explore_beyond_goals
-        if visit_cell_size is not None and not visit_cell_size > 0:
-            raise ValueError(f"visit_cell_size must be positive, got {visit_cell_size}")
         self.visit_cell_size = visit_cell_size
+        for name in ("compared_length", "visit_cell_size"):
+            length = getattr(self, name)
+            if length is not None and not 0 < length < float("inf"):
+                raise ValueError(f"{name} must be positive and finite, or None, got {length}")
         super().__init__(
             buffer_size,
             observation_space,
@@ -287,6 +294,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         """
         :param other: The buffer that this one, loaded from a file, takes the place of
         """
+        if (self.compared_length, self.loop_share) != (other.compared_length, other.loop_share):
+            self._forget_paths()
         for name in ("success_key", *_MODE_SETTINGS):
             setattr(self, name, getattr(other, name))
         self.move_storage(other.storage_device)
@@ -306,11 +315,26 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param full_path: Mode features along a trajectory, shape [L, dim]
         :return: What clustering compares, shape [n_path_points, dim]
         """
+        return resample_path(self._without_loops(full_path), self.n_path_points, self.compared_length)
+
+    def _route(self, trajectory: Trajectory) -> np.ndarray:
+        """As ``path``, but all of it, shape [n_path_points, dim]."""
+        if self.compared_length is None:
+            return self.path(trajectory)
+        return resample_path(self._without_loops(self.full_path(trajectory)), self.n_path_points)
+
+    def _without_loops(self, full_path: np.ndarray) -> np.ndarray:
         if self._feature_scale is None:
             self._feature_scale = self._measure_scale()
         path = full_path / self._feature_scale
-        path = erase_loops(path, self.loop_share * float(np.linalg.norm(np.ptp(path, axis=0))))
-        return resample_path(path, self.n_path_points)
+        return erase_loops(path, self.loop_share * float(np.linalg.norm(np.ptp(path, axis=0))))
+
+    def _forget_paths(self) -> None:
+        """What is compared has changed."""
+        self._distances = DistanceCache(self.normalize_distances)
+        for success in (True, False):
+            for trajectory in self.trajectories(success):
+                trajectory.path = None
 
     def full_path(self, trajectory: Trajectory) -> np.ndarray:
         """
@@ -433,7 +457,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         """
         trajectory.foreign = True
         self.foreign[trajectory.rows] = True
-        route = np.concatenate([self.path(member) for member in members])
+        route = np.concatenate([self._route(member) for member in members])
         reached = self.full_path(trajectory)[1:] / self._feature_scale
         extent = float(np.linalg.norm(np.ptp(route, axis=0)))
         off_route = cdist(reached, route).min(axis=1) > self.route_share * extent

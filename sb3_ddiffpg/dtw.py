@@ -31,13 +31,14 @@ def erase_loops(path: np.ndarray, radius: float) -> np.ndarray:
     return path[kept]
 
 
-def resample_path(path: np.ndarray, n_points: int) -> np.ndarray:
+def resample_path(path: np.ndarray, n_points: int, arc_length: float | None = None) -> np.ndarray:
     """
     Points at equal distances of arc length along the polyline through ``path``: what is left of a trajectory when
     its speed, its pauses and its number of steps are forgotten. The first and last points are kept.
 
     :param path: points in the order they were visited, shape ``[length, dims]``, length at least 1
     :param n_points: number of points returned, at least 1 (a single one is the first point)
+    :param arc_length: of the end of the path, of which alone the points are taken; None for the whole path
     :return: float32 array of shape ``[n_points, dims]``; a path that never moves gives copies of its first point
     :raises ValueError: if ``path`` is not of that shape or not finite, or ``n_points`` is less than 1
     """
@@ -45,7 +46,8 @@ def resample_path(path: np.ndarray, n_points: int) -> np.ndarray:
         raise ValueError(f"n_points must be at least 1, got {n_points}")
     points = np.asarray(_check_path(path, "path"), dtype=np.float64)
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    targets = np.linspace(0.0, travelled[-1], n_points)
+    start = 0.0 if arc_length is None else max(0.0, travelled[-1] - arc_length)
+    targets = np.linspace(start, travelled[-1], n_points)
     # A repeated point is a segment of length zero; np.interp wants increasing abscissae, so each stays once.
     moved = np.concatenate([[True], np.diff(travelled) > 0.0])
     columns = [np.interp(targets, travelled[moved], column) for column in points[moved].T]

@@ -374,6 +374,33 @@ def test_cached_distances_follow_the_trajectories():
     assert [trajectory.serial for trajectory in successes] == [6, 7, 8, 9, 10, 11]
 
 
+def two_wanderers() -> list[np.ndarray]:
+    """Both go straight from 2 to 8 at the end; before that one went up, the other down."""
+    return [np.concatenate(([[0, 0], [1, side], [2, side]], straight(8)[2:])).astype(np.float32) for side in (1, -1)]
+
+
+@pytest.mark.parametrize(("compared_length", "differs"), [(None, True), (8.0, True), (6.0, False), (3.0, False)])
+def test_what_was_done_before_the_compared_end_does_not_count(compared_length, differs):
+    buffer = make_buffer(500, mode_features=[0, 1], compared_length=compared_length)
+    fill(buffer, two_wanderers())
+    distance = buffer.success_distances(buffer.trajectories(True))[0, 1]
+    assert distance > 0.2 if differs else distance == 0.0
+
+
+def test_another_compared_length_makes_known_distances_anew():
+    fresh, loaded = (make_buffer(500, mode_features=[0, 1], compared_length=length) for length in (3.0, None))
+    for buffer in (fresh, loaded):
+        fill(buffer, two_wanderers())
+    assert fresh.success_distances(fresh.trajectories(True))[0, 1] == 0
+    before = loaded.success_distances(loaded.trajectories(True))
+    loaded.adopt_settings(fresh)
+    after = loaded.success_distances(loaded.trajectories(True))
+    assert before[0, 1] > 0 and after[0, 1] == 0
+    restored = make_buffer(500, mode_features=[0, 1], compared_length=None)
+    restore_buffer(restored, buffer_state(fresh))
+    np.testing.assert_array_equal(restored.success_distances(restored.trajectories(True)), before)
+
+
 def test_a_rare_mode_is_never_crowded_out():
     buffer = make_buffer(buffer_size=100, mode_features=[0, 1])
     line = np.stack([np.arange(11), np.zeros(11)], axis=1).astype(np.float32)
@@ -468,9 +495,10 @@ def test_goals_by_new_ways_are_worth_something_to_exploration():
     assert buffer.way_novelty[buffer._running[0, 0]] == 0.0
 
 
-def test_a_mode_is_shown_a_foreign_trajectory_as_a_way_off_its_route():
+@pytest.mark.parametrize("compared_length", [None, 1.0])
+def test_a_mode_is_shown_a_foreign_trajectory_as_a_way_off_its_route(compared_length):
     """Up to where it leaves the route it is as any other; from there on it is worth nothing, and the end."""
-    buffer = make_buffer(500, mode_features=[0, 1])
+    buffer = make_buffer(500, mode_features=[0, 1], compared_length=compared_length)
     leaves = np.array([[0, 0], [1, 0], [2, 0], [3, 2], [4, 4], [5, 4], [8, 0]], dtype=np.float32)
     fill(buffer, [straight(8)] * 3)
     fill(buffer, [leaves], reward=5.0)
@@ -709,6 +737,9 @@ def test_a_limit_without_handling_of_timeouts_is_terminal():
         ("max_successes_per_mode", 0),
         ("max_failures_per_mode", -1),
         ("n_path_points", 1),
+        ("compared_length", 0.0),
+        ("compared_length", float("nan")),
+        ("visit_cell_size", -1.0),
         ("optimize_memory_usage", True),
     ],
 )

@@ -126,6 +126,12 @@ def test_resampling_a_corner_by_hand():
     assert resampled.dtype == np.float32
 
 
+def test_resampling_the_end_of_a_corner_by_hand():
+    path = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 1.0]])
+    np.testing.assert_allclose(resample_path(path, 4, 1.5), [[2.5, 0.0], [3.0, 0.0], [3.0, 0.5], [3.0, 1.0]], atol=1e-6)
+    np.testing.assert_array_equal(resample_path(path, 5, 4.5), resample_path(path, 5))
+
+
 def test_resampling_forgets_speed_and_pauses():
     route = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [-2.0, 4.0]])
     slow = np.concatenate([np.linspace(a, b, 40) for a, b in pairwise(route)])
