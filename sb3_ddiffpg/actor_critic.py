@@ -370,8 +370,13 @@ class NoveltyActorCritic(SavableAlgorithm):
             ordinary = (self.intrinsic_moments.mean / scale).clamp(max=self.intrinsic_clip)
             modes_present = th.from_numpy(present[1:]).to(self.device, non_blocking=True)
             rewards[1:] -= ordinary * modes_present
-        discounts = self.gamma ** th.arange(windows.shape[-1], device=self.device)
-        return self.intrinsic_coef * (rewards * discounts).sum(dim=-1).float()
+        steps = th.arange(windows.shape[-1], device=self.device)
+        rewards[:1] *= self._exploration_gamma() ** steps
+        rewards[1:] *= self.gamma**steps
+        return self.intrinsic_coef * rewards.sum(dim=-1).float()
+
+    def _exploration_gamma(self) -> float:
+        return self.gamma
 
     def _pays(self, windows: np.ndarray, present: np.ndarray, positions: th.Tensor) -> th.Tensor:
         """

@@ -482,7 +482,13 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     # ------------------------------------------------------------------ sampling
 
     def sample_modes(
-        self, batch_size: int, gamma: float, exploration_n_steps: int, mode_n_steps: int, env: VecNormalize | None = None
+        self,
+        batch_size: int,
+        gamma: float,
+        exploration_n_steps: int,
+        mode_n_steps: int,
+        env: VecNormalize | None = None,
+        exploration_gamma: float | None = None,
     ) -> ModeBatch:
         """
         Draw one multimodal batch: an equal part from all transitions (exploratory group) and from each mode's own.
@@ -492,6 +498,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param exploration_n_steps: Length of the exploratory group's returns
         :param mode_n_steps: Length of the modes' returns
         :param env: Normalises observations and rewards when given
+        :param exploration_gamma: The exploratory group's discount factor; None: gamma
         :return: The batch
         """
         n_groups = len(self.mode_rows) + 1
@@ -506,7 +513,10 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             rows[EXPLORATORY_GROUP, :n_new] = np.random.choice(self._new_way_rows, n_new)
         windows, notes = self._windows(rows, exploration_n_steps, mode_n_steps)
         present = windows >= 0
-        powers = np.float32(gamma) ** np.arange(windows.shape[-1], dtype=np.float32)
+        gammas = np.full((n_groups, 1), gamma, dtype=np.float32)
+        if exploration_gamma is not None:
+            gammas[EXPLORATORY_GROUP] = exploration_gamma
+        powers = gammas[..., None] ** np.arange(windows.shape[-1], dtype=np.float32)
         rewards = self._normalize_reward(notes["rewards"].ravel(), env).reshape(windows.shape)
         # For its mode a step off the route ends the episode without reward, so that no way back is worth anything
         lost = np.logical_or.accumulate(notes["off_route"] & present, axis=-1)
@@ -526,7 +536,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             # for ends it, or it would be paid again and again
             unpaid = notes["goals"] & ~((notes["way_novelty"] > 0) & (self.new_way_share > 0))
             ended[EXPLORATORY_GROUP] &= ~np.take_along_axis(unpaid, ends, axis=-1)[EXPLORATORY_GROUP, :, 0]
-        discounts = np.float32(gamma) ** lengths * ~(ended | lost.any(axis=-1))
+        discounts = gammas**lengths * ~(ended | lost.any(axis=-1))
         steps = self._on_device(self._steps.tensors(rows.ravel()))
         nexts = self._on_device(self._nexts.tensors(last))
         actions, exploratory, targets = (

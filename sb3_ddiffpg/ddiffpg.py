@@ -74,10 +74,11 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param v_min: Lower end of the values' support
     :param v_max: Upper end of the support of the modes' critics
     :param exploration_v_max: Upper end of the support of the exploratory critics (the lower end is 0); None: what novelty can
-        be worth at most, ``intrinsic_clip * intrinsic_coef / (1 - gamma)``, or ``v_max`` if that is more
+        be worth at most, ``intrinsic_clip * intrinsic_coef / (1 - exploration_gamma)``, or ``v_max`` if that is more
     :param reward_scale: Factor on the environment's reward
     :param mode_n_steps: Length of the multi-step returns of the modes' critics (uncorrected)
     :param exploration_n_steps: The same for the exploratory critics
+    :param exploration_gamma: Discount factor of the exploratory critics; None: ``gamma``
     :param target_policy_noise: Standard deviation of the noise on the actions in the Bellman target
     :param target_noise_clip: Limit of that noise
     :param backup_embedding: What the policy in a mode's Bellman target is conditioned on: ``"mode"``, its own embedding, or
@@ -178,6 +179,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         reward_scale: float = 1.0,
         mode_n_steps: int = 5,
         exploration_n_steps: int = 1,
+        exploration_gamma: float | None = None,
         target_policy_noise: float = 0.8,
         target_noise_clip: float = 0.2,
         backup_embedding: str = "mode",
@@ -270,6 +272,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         self.exploration_v_max = exploration_v_max
         self.mode_n_steps = mode_n_steps
         self.exploration_n_steps = exploration_n_steps
+        self.exploration_gamma = exploration_gamma
         self.backup_embedding = backup_embedding
         self.recluster_freq = recluster_freq
         self.distance_threshold = distance_threshold
@@ -318,7 +321,10 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     def _exploration_v_max(self) -> float:
         if self.exploration_v_max is not None:
             return self.exploration_v_max
-        return max(self.v_max, self.intrinsic_clip * self.intrinsic_coef / max(1 - self.gamma, 1e-4))
+        return max(self.v_max, self.intrinsic_clip * self.intrinsic_coef / max(1 - self._exploration_gamma(), 1e-4))
+
+    def _exploration_gamma(self) -> float:
+        return self.gamma if self.exploration_gamma is None else self.exploration_gamma
 
     def _buffer_arguments(self) -> dict[str, Any]:
         return {
@@ -362,9 +368,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         metrics: dict[str, list[th.Tensor]] = defaultdict(list)
         for _ in range(gradient_steps):
             # Sample one batch per mode, and one for the exploratory group
-            batch = self.replay_buffer.sample_modes(
-                batch_size, self.gamma, self.exploration_n_steps, self.mode_n_steps, env=self._vec_normalize_env
-            )
+            batch = self._sample_modes(batch_size)
             rewards = self._rewards(batch, metrics)
             # Update each critic with the Bellman equation on its own batch
             self._update_critics(batch, rewards, metrics)
@@ -375,6 +379,16 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             metrics["actor_loss"].append(self._update_policy(batch, target_actions))
             self._update_targets()
         self._end_updates(gradient_steps, metrics)
+
+    def _sample_modes(self, batch_size: int) -> ModeBatch:
+        return self.replay_buffer.sample_modes(
+            batch_size,
+            self.gamma,
+            self.exploration_n_steps,
+            self.mode_n_steps,
+            env=self._vec_normalize_env,
+            exploration_gamma=self._exploration_gamma(),
+        )
 
     def _critic_names(self) -> list[str]:
         return ["exploratory critics", *(f"critics of {mode.name!r}" for mode in self._modes)]

@@ -50,6 +50,7 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
         "lie in [0, 1]",
         _is_share,
     ),
+    (("exploration_gamma",), "lie in [0, 1], or be None", lambda value: value is None or _is_share(value)),
     (("max_grad_norm",), "be positive", lambda value: _is_number(value) and value > 0),
     (
         ("action_lr", "reward_scale", "intrinsic_clip"),

@@ -112,7 +112,7 @@ class PlainBuffer:
         limit = max(1.5 * lengths[0], lengths[:5][-1])
         return [episode for episode in episodes if len(episode["steps"]) <= limit]
 
-    def window(self, number, n_steps, for_mode):
+    def window(self, number, n_steps, for_mode, gamma=GAMMA):
         """
         n-step reward, discount and the last step of the window that begins with a step. For a mode, a step off its route is
         the end, without reward; for exploration a goal is none if it shall go on beyond.
@@ -124,7 +124,7 @@ class PlainBuffer:
         for last in steps[first : first + n_steps]:
             lost = lost or (for_mode and last["off_route"])
             reward += 0.0 if lost else discount * last["reward"]
-            discount *= GAMMA
+            discount *= gamma
         ended = last["done"] and not last["timeout"] and not (last["goal"] and self.explore_beyond_goals and not for_mode)
         return reward, 0.0 if lost or ended else discount, last
 
@@ -217,11 +217,16 @@ class BufferMachine(RuleBasedStateMachine):
         self.buffer.assign_modes(successes, labels, failures, failure_labels, parents)
         self.plain.assign(labels.tolist(), failure_labels.tolist(), parents)
 
-    @rule(batch_size=st.integers(8, 40), exploration=st.integers(1, 3), mode=st.integers(1, 5))
-    def improve(self, batch_size, exploration, mode):
+    @rule(
+        batch_size=st.integers(8, 40),
+        exploration=st.integers(1, 3),
+        mode=st.integers(1, 5),
+        exploration_gamma=st.sampled_from([None, 0.5]),
+    )
+    def improve(self, batch_size, exploration, mode, exploration_gamma):
         if not self.number or not self.buffer.size():
             return
-        batch = self.buffer.sample_modes(batch_size, GAMMA, exploration, mode)
+        batch = self.buffer.sample_modes(batch_size, GAMMA, exploration, mode, exploration_gamma=exploration_gamma)
         n = batch_size // (self.plain.n_modes + 1)
         assert batch.rows.shape == (self.plain.n_modes + 1, n)
         numbers = batch.observations[:, 0].numpy().astype(int).reshape(batch.rows.shape)
@@ -234,7 +239,8 @@ class BufferMachine(RuleBasedStateMachine):
             number, step = numbers[group, column], by_number[numbers[group, column]]
             if group > 0 and batch.active[group]:
                 assert owner[number] == group - 1
-            reward, discount, last = self.plain.window(number, mode if group else exploration, group > 0)
+            gamma = GAMMA if group else exploration_gamma or GAMMA
+            reward, discount, last = self.plain.window(number, mode if group else exploration, group > 0, gamma)
             assert batch.rewards[group, column].item() == pytest.approx(reward, rel=1e-4, abs=1e-5)
             assert batch.discounts[group, column].item() == pytest.approx(discount, rel=1e-5)
             np.testing.assert_array_equal(next_obs[group, column], last["next_obs"])

@@ -182,7 +182,7 @@ def test_standing_where_nobody_was_pays_once():
         assert (rewards > 0).sum() == paid
 
 
-def slow_intrinsic_reward(model, window, scale=1.0, ordinary=0.0):
+def slow_intrinsic_reward(model, window, scale=1.0, ordinary=0.0, gamma=None):
     """Discounted NovelD rewards of a window, row by row, where they are paid, less what is ordinary."""
     total = 0.0
     first = slow_first_visits(model.replay_buffer, 0.5)
@@ -192,16 +192,19 @@ def slow_intrinsic_reward(model, window, scale=1.0, ordinary=0.0):
             for obs in (model.replay_buffer.observations, model.replay_buffer.next_observations)
         )
         reward = max(then - model.novelty_scale * now, 0.0) * (int(row) in first)
-        total += model.gamma**k * (min(reward / scale, 10.0) - ordinary)
+        total += (gamma or model.gamma) ** k * (min(reward / scale, 10.0) - ordinary)
     return model.intrinsic_coef * total
 
 
-@pytest.mark.parametrize("mode_intrinsic_coef", [0.0, 0.5])
-@pytest.mark.parametrize("novelty", ["rnd", "counts"])
-def test_rewards_of_a_batch(novelty, mode_intrinsic_coef):
+@pytest.mark.parametrize(
+    ("novelty", "mode_intrinsic_coef", "exploration_gamma"),
+    [("rnd", 0.0, None), ("counts", 0.0, None), ("rnd", 0.5, None), ("counts", 0.5, None), ("counts", 0.5, 0.7)],
+)
+def test_rewards_of_a_batch(novelty, mode_intrinsic_coef, exploration_gamma):
     model = filled_model(
         novelty=novelty,
         mode_intrinsic_coef=mode_intrinsic_coef,
+        exploration_gamma=exploration_gamma,
         normalize_intrinsic=False,
         exploration_n_steps=3,
         reward_scale=2.0,
@@ -209,7 +212,8 @@ def test_rewards_of_a_batch(novelty, mode_intrinsic_coef):
     batch = model.replay_buffer.sample_modes(24, model.gamma, 3, 5)
     expected = 2.0 * batch.rewards.numpy()
     for group, column in np.ndindex(expected.shape):
-        intrinsic = slow_intrinsic_reward(model, batch.windows[group, column])
+        gamma = model.gamma if group else exploration_gamma
+        intrinsic = slow_intrinsic_reward(model, batch.windows[group, column], gamma=gamma)
         if group == 0:
             expected[group, column] = intrinsic  # the environment's reward plays no part in exploration
         else:

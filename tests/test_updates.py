@@ -234,6 +234,17 @@ def test_metrics_of_an_update():
     assert model._n_updates == before + 3
 
 
+def test_explorers_may_have_a_horizon_of_their_own():
+    model = trained_model(gamma=0.9, exploration_gamma=0.5, intrinsic_coef=2.0, intrinsic_clip=10.0)
+    batch = model._sample_modes(90)
+    lengths, discounts = (batch.windows >= 0).sum(axis=-1), batch.discounts.numpy()
+    for group, gamma in ((0, 0.5), (1, 0.9)):
+        goes_on = discounts[group] > 0
+        assert goes_on.any()
+        np.testing.assert_allclose(discounts[group][goes_on], gamma ** lengths[group][goes_on], rtol=1e-6)
+    assert model.policy.critics.upper.tolist() == [2.0 * 10.0 / (1 - 0.5), model.v_max]
+
+
 @pytest.mark.parametrize("n_atoms", [1, 51])
 def test_values_that_the_support_cuts_off_are_told(n_atoms):
     """An explorer whose values all lie at the limit does not know where to go; nothing else shows it."""
