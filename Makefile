@@ -3,7 +3,7 @@ PYTHON := $(shell python3.11 -c "print('python3.11')" 2>/dev/null || echo python
 BIN := .venv/bin
 DEPENDENCIES := setup.cfg pyproject.toml constraints.txt
 
-.PHONY: demo test fast slow gpu fuzz lint type format bench clean
+.PHONY: demo test fast slow gpu fuzz soak lint type format bench clean
 
 demo: .venv/.installed
 	$(BIN)/python examples/demo.py
@@ -27,6 +27,10 @@ fuzz: .venv/.installed-dev
 	$(BIN)/pip install --quiet -e ".[fuzz]"
 	for test in $$(sed -n 's/^def test_\(\w*\).*/\1/p' tests/test_hostile_input.py); do \
 		OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz.py $$test -max_total_time=$(SECONDS) || exit 1; done
+
+# half an hour
+soak: .venv/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python tests/soak.py
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff check .

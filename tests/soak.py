@@ -1,0 +1,99 @@
+"""
+A long training with a full buffer and many re-clusterings, watched: memory, open files, threads, processes and processor time.
+Ends with an error if one of them grew between its second quarter and its last.
+
+    python tests/soak.py                      # 2e6 steps
+    python tests/soak.py --steps 200000
+"""
+
+import argparse
+import sys
+import tempfile
+from statistics import median
+
+import psutil
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.checkpoints import RunCheckpointCallback
+from sb3_ddiffpg.envs import make_vec_env
+
+N_SAMPLES = 40
+# Shares by which the last quarter may be more than the second
+ALLOWED = {"memory_mb": 0.02, "files": 0.0, "threads": 0.0, "processes": 0.0, "cpu_seconds": 0.15}
+
+
+class Watch(BaseCallback):
+    """
+    Measures the process from time to time.
+
+    :param every: Environment steps between two measurements
+    """
+
+    def __init__(self, every: int) -> None:
+        super().__init__()
+        self.every, self.process = every, psutil.Process()
+        self.samples: list[dict[str, float]] = []
+        self._then = 0.0
+
+    def _on_training_start(self) -> None:
+        self._then = self._cpu_seconds()
+        print("steps", *ALLOWED, "modes", sep="\t")
+
+    def _cpu_seconds(self) -> float:
+        """Not the clock's: others may be busy too."""
+        times = self.process.cpu_times()
+        return times.user + times.system
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps < self.every * (len(self.samples) + 1):
+            return
+        now = self._cpu_seconds()
+        sample = {
+            "memory_mb": self.process.memory_full_info().uss / 2**20,
+            "files": len(self.process.open_files()) + len(self.process.net_connections()),
+            "threads": self.process.num_threads(),
+            "processes": len(self.process.children(recursive=True)),
+            "cpu_seconds": now - self._then,
+        }
+        self._then = now
+        self.samples.append(sample)
+        n_modes = len(self.model.modes)  # type: ignore[attr-defined]
+        print(self.num_timesteps, *(f"{value:.1f}" for value in sample.values()), n_modes, sep="\t", flush=True)
+
+
+def grown(samples: list[dict[str, float]]) -> list[str]:
+    """
+    :param samples: At equal distances
+    :return: What grew by more than it may, in words
+    """
+    quarter = len(samples) // 4
+    found = []
+    for name, share in ALLOWED.items():
+        early, late = (median(each[name] for each in part) for part in (samples[quarter : 2 * quarter], samples[-quarter:]))
+        if late > early * (1 + share):
+            found.append(f"{name}: {early:.1f} in the second quarter, {late:.1f} in the last")
+    return found
+
+
+def main() -> None:
+    """Read the command line, train and judge."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=2_000_000)
+    parser.add_argument("--env", default="PointMazeV1-v0")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    env = make_vec_env(options.env, 64, seed=options.seed)
+    model = DDiffPG("DiffusionPolicy", env, buffer_size=20_000, recluster_freq=1, seed=options.seed, device="cpu")
+    watch = Watch(options.steps // N_SAMPLES)
+    with tempfile.TemporaryDirectory() as folder:
+        model.learn(options.steps, callback=[watch, RunCheckpointCallback(folder, save_freq=options.steps // 20)])
+    problems = grown(watch.samples)
+    sys.exit("\n".join(problems) if problems else 0)
+
+
+if __name__ == "__main__":
+    main()
