@@ -43,6 +43,9 @@ class ModeBatch(NamedTuple):
     windows: np.ndarray
 
 
+# Defaults of the paths that are compared
+N_PATH_POINTS, LOOP_SHARE = 48, 0.05
+
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
     *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct"),
@@ -109,10 +112,10 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         max_failures_per_mode: int = 20,
         max_length_ratio: float = 1.5,
         min_direct: int = 5,
-        n_path_points: int = 48,
+        n_path_points: int = N_PATH_POINTS,
         normalize_distances: bool = True,
         compared_length: float | None = None,
-        loop_share: float = 0.05,
+        loop_share: float = LOOP_SHARE,
         route_share: float = 0.1,
         new_way_share: float = 0.0,
         explore_beyond_goals: bool = False,
