@@ -58,7 +58,12 @@ class _Buffer(msgspec.Struct, forbid_unknown_fields=True):
     serials: np.ndarray
     distances: np.ndarray
     compared_length: float | None = None
+    loop_share: float | None = None
+    normalize_distances: bool | None = None
 
+
+# Settings on which they depend, beside ``n_path_points``
+_OF_DISTANCES = ("compared_length", "loop_share", "normalize_distances")
 
 # Columns of ``_Trajectories`` that have one number for each
 _COLUMNS = {
@@ -117,7 +122,7 @@ def buffer_state(buffer: ModeReplayBuffer) -> dict[str, Any] | None:
         "last_positions": buffer._last_positions,
         "serials": buffer._distances.serials,
         "distances": buffer._distances.distances,
-        "compared_length": buffer.compared_length,
+        **{name: getattr(buffer, name) for name in _OF_DISTANCES},
     }
 
 
@@ -162,7 +167,7 @@ def restore_buffer(buffer: ModeReplayBuffer, tree: Any) -> None:
     buffer._success_rule.recent_returns.extend(state.recent_returns)
     buffer.owner = state.owner
     buffer._feature_scale, buffer._last_positions = state.feature_scale, state.last_positions
-    if state.compared_length == buffer.compared_length:  # else they are other paths' distances
+    if all(getattr(state, name) == getattr(buffer, name) for name in _OF_DISTANCES):  # else they are of other paths
         buffer._distances.serials, buffer._distances.distances = state.serials, state.distances
     buffer.recall_places()
 

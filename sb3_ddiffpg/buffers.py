@@ -1,6 +1,7 @@
 """Replay buffer that knows modes, and stores target actions beside every action."""
 
 from collections.abc import Collection, Sequence
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,17 +78,19 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     :param n_path_points: Points to which a trajectory's path is resampled for clustering
     :param normalize_distances: Whether DTW distances are divided by the square root of the path's length, which makes them
         about the mean distance along the way; False for the root of the summed squares, to which the paper's thresholds refer
-    :param compared_length: How much of a path's end is compared, in the unit of the mode features; None: all of it. What an
-        explorer did before it took a way says nothing about the way
+    :param compared_length: Arc length of a path's end, without its loops, that alone is compared; None: all of it. What an
+        explorer did before it took a way says nothing about the way. In the unit of the mode features, of a whole observation
+        in standard deviations
     :param loop_share: Radius within which a path that comes back has made a loop, as a share of the path's extent
     :param route_share: Distance beyond which a step is off a mode's route, as a share of the route's extent
     :param new_way_share: Share of the exploratory group's rows that are drawn from trajectories which reached a goal by a way
         of which a mode has not its fill
     :param explore_beyond_goals: Whether a goal does not end the exploratory group's returns
     :param visit_cell_size: Edge of the cells of mode features by which places and ``first_visits`` are told; None: not at all
-    :raises ValueError: If a size is not positive or ``optimize_memory_usage`` is asked for
+    :raises ValueError: If a size is not positive and finite or ``optimize_memory_usage`` is asked for
     """
 
+    compared_length: float | None = None  # a buffer that was pickled before there was such a thing has none
     target_actions: Any
     exploratory_target_actions: Any
     foreign: np.ndarray
@@ -148,8 +151,10 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.visit_cell_size = visit_cell_size
         for name in ("compared_length", "visit_cell_size"):
             length = getattr(self, name)
-            if length is not None and not 0 < length < float("inf"):
-                raise ValueError(f"{name} must be positive and finite, or None, got {length}")
+            is_number = isinstance(length, Real) and not isinstance(length, bool)
+            if length is not None and not (is_number and 0 < length < float("inf")):
+                raise ValueError(f"{name} must be a positive and finite number, or None, got {length!r}")
+            setattr(self, name, None if length is None else float(length))
         super().__init__(
             buffer_size,
             observation_space,
@@ -307,7 +312,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     def path(self, trajectory: Trajectory) -> np.ndarray:
         """
         :param trajectory: A stored trajectory
-        :return: Its mode features, terminal state included, resampled; shape [n_path_points, dim]
+        :return: What clustering compares of it: mode features, terminal state included, resampled; shape [n_path_points, dim]
         """
         if trajectory.path is None:
             trajectory.path = self.resample(self.full_path(trajectory))
@@ -318,19 +323,11 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param full_path: Mode features along a trajectory, shape [L, dim]
         :return: What clustering compares, shape [n_path_points, dim]
         """
-        return resample_path(self._without_loops(full_path), self.n_path_points, self.compared_length)
-
-    def _route(self, trajectory: Trajectory) -> np.ndarray:
-        """As ``path``, but all of it, shape [n_path_points, dim]."""
-        if self.compared_length is None:
-            return self.path(trajectory)
-        return resample_path(self._without_loops(self.full_path(trajectory)), self.n_path_points)
-
-    def _without_loops(self, full_path: np.ndarray) -> np.ndarray:
         if self._feature_scale is None:
             self._feature_scale = self._measure_scale()
         path = full_path / self._feature_scale
-        return erase_loops(path, self.loop_share * float(np.linalg.norm(np.ptp(path, axis=0))))
+        path = erase_loops(path, self.loop_share * float(np.linalg.norm(np.ptp(path, axis=0))))
+        return resample_path(path, self.n_path_points, self.compared_length)
 
     def _forget_paths(self) -> None:
         """What is compared has changed."""
@@ -460,10 +457,14 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         """
         trajectory.foreign = True
         self.foreign[trajectory.rows] = True
-        route = np.concatenate([self._route(member) for member in members])
-        reached = self.full_path(trajectory)[1:] / self._feature_scale
+        route = np.concatenate([self.path(member) for member in members])
+        full_path = self.full_path(trajectory) / self._feature_scale
+        reached = full_path[1:]
         extent = float(np.linalg.norm(np.ptp(route, axis=0)))
         off_route = cdist(reached, route).min(axis=1) > self.route_share * extent
+        if self.compared_length is not None:  # the members' routes before that are not known
+            steps = np.linalg.norm(np.diff(full_path, axis=0), axis=1)
+            off_route &= steps.sum() - steps.cumsum() <= self.compared_length
         ends = np.stack([self.path(member)[-1] for member in members])
         off_route[-1] |= cdist(reached[-1:], ends).min() > self.loop_share * extent
         self.off_route[trajectory.rows] = off_route

@@ -630,7 +630,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
         Load a replay buffer of this model's run, saved with it or at another time: trajectories follow their modes. What
-        trains a mode stays as the model was made; size and unit of distances are those of the file.
+        trains a mode, and what of a path is compared, stays as the model was made; number of points and unit of distances are
+        those of the file.
 
         :param path: Path to the pickled replay buffer
         :param truncate_last_traj: Whether the next ``learn`` resets the environments and drops the episodes in progress

@@ -38,12 +38,16 @@ def resample_path(path: np.ndarray, n_points: int, arc_length: float | None = No
 
     :param path: points in the order they were visited, shape ``[length, dims]``, length at least 1
     :param n_points: number of points returned, at least 1 (a single one is the first point)
-    :param arc_length: of the end of the path, of which alone the points are taken; None for the whole path
+    :param arc_length: of the end of the path, which alone is resampled: it begins that far before the last point. None, or
+        more than there is: the whole path
     :return: float32 array of shape ``[n_points, dims]``; a path that never moves gives copies of its first point
-    :raises ValueError: if ``path`` is not of that shape or not finite, or ``n_points`` is less than 1
+    :raises ValueError: if ``path`` is not of that shape or not finite, ``n_points`` is less than 1, or ``arc_length`` is not
+        positive
     """
     if n_points < 1:
         raise ValueError(f"n_points must be at least 1, got {n_points}")
+    if arc_length is not None and not arc_length > 0:
+        raise ValueError(f"arc_length must be positive, or None, got {arc_length}")
     points = np.asarray(_check_path(path, "path"), dtype=np.float64)
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     start = 0.0 if arc_length is None else max(0.0, travelled[-1] - arc_length)

@@ -400,7 +400,8 @@ def _labels(model: Any, runs: list[list[EpisodeResult]]) -> tuple[list[list[str 
             scale = np.maximum(np.concatenate(full).std(axis=0), 1e-6)
             full = [path / scale for path in full]
         short = [erase_loops(path, LOOP_SHARE * float(np.linalg.norm(np.ptp(path, axis=0)))) for path in full]
-        paths, normalize, linkage = [resample_path(path, N_PATH_POINTS) for path in short], True, "average"
+        compared_length = getattr(buffer, "compared_length", None)
+        paths, normalize, linkage = [resample_path(path, N_PATH_POINTS, compared_length) for path in short], True, "average"
     threshold, min_size = getattr(model, "distance_threshold", None), 1 if len(paths) < 3 else 3
     numbers = iter(cluster(dtw_distances(paths, normalize=normalize), threshold, linkage, min_size=min_size))
     names = [[_cluster_name(next(numbers)) if _reached(episode) else None for episode in run] for run in runs]

@@ -28,7 +28,8 @@ class Trajectory:
         a failure, so that it learns to keep to its own
     :param label: Ground truth of the way it took, ``info["mode"]`` of its last step, None if there is none; for evaluation,
         no part of the algorithm sees it
-    :param path: Mode features resampled to equal steps, shape [n_path_points, dim]; made when first needed
+    :param path: What clustering compares: mode features resampled to equal steps, shape [n_path_points, dim]; made when first
+        needed
     """
 
     rows: np.ndarray

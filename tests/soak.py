@@ -18,9 +18,10 @@ from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.checkpoints import RunCheckpointCallback
 from sb3_ddiffpg.envs import make_vec_env
 
-N_SAMPLES = 40
-# Shares by which the last quarter may be more than the second
+N_SAMPLES, N_ENVS = 40, 64
+# Shares by which the last quarter may be more than the second, and by how much at least, where a clock is coarse
 ALLOWED = {"memory_mb": 0.02, "files": 0.0, "threads": 0.0, "processes": 0.0, "cpu_seconds": 0.15}
+RESOLUTION = 0.1
 
 
 class Watch(BaseCallback):
@@ -54,7 +55,7 @@ class Watch(BaseCallback):
         now = self._cpu_seconds()
         sample = {
             "memory_mb": self.process.memory_full_info().uss / 2**20,
-            "files": len(self.process.open_files()) + len(self.process.net_connections()),
+            "files": self.process.num_fds(),
             "threads": self.process.num_threads(),
             "processes": len(self.process.children(recursive=True)),
             "cpu_seconds": now - self._then,
@@ -74,7 +75,7 @@ def grown(samples: list[dict[str, float]]) -> list[str]:
     found = []
     for name, share in ALLOWED.items():
         early, late = (median(each[name] for each in part) for part in (samples[quarter : 2 * quarter], samples[-quarter:]))
-        if late > early * (1 + share):
+        if late - early > max(share * early, RESOLUTION):
             found.append(f"{name}: {early:.1f} in the second quarter, {late:.1f} in the last")
     return found
 
@@ -86,7 +87,9 @@ def main() -> None:
     parser.add_argument("--env", default="PointMazeV1-v0")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    env = make_vec_env(options.env, 64, seed=options.seed)
+    if options.steps < N_SAMPLES * N_ENVS:
+        parser.error(f"--steps must be at least {N_SAMPLES * N_ENVS}, got {options.steps}")
+    env = make_vec_env(options.env, N_ENVS, seed=options.seed)
     model = DDiffPG("DiffusionPolicy", env, buffer_size=20_000, recluster_freq=1, seed=options.seed, device="cpu")
     watch = Watch(options.steps // N_SAMPLES)
     with tempfile.TemporaryDirectory() as folder:

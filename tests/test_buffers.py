@@ -402,9 +402,24 @@ def test_another_compared_length_makes_known_distances_anew():
     loaded.adopt_settings(fresh)
     after = loaded.success_distances(loaded.trajectories(True))
     assert before[0, 1] > 0 and after[0, 1] == 0
-    restored = make_buffer(500, mode_features=[0, 1], compared_length=None)
-    restore_buffer(restored, buffer_state(fresh))
-    np.testing.assert_array_equal(restored.success_distances(restored.trajectories(True)), before)
+    for changed in ({"compared_length": None}, {"loop_share": 0.5}, {"normalize_distances": False}):
+        settings = {"compared_length": 3.0, "mode_features": [0, 1]} | changed
+        restored, new = make_buffer(500, **settings), make_buffer(500, **settings)
+        restore_buffer(restored, buffer_state(loaded))
+        fill(new, two_wanderers())
+        expected = new.success_distances(new.trajectories(True))
+        np.testing.assert_array_equal(restored.success_distances(restored.trajectories(True)), expected)
+
+
+def test_a_buffer_from_before_there_was_a_compared_length():
+    model = small_model(DummyVecEnv([TwoEnds] * 2))
+    model.learn(200)
+    del model.replay_buffer.__dict__["compared_length"]
+    stream = io.BytesIO()
+    model.save_replay_buffer(stream)
+    stream.seek(0)
+    model.load_replay_buffer(stream)
+    assert model.replay_buffer.compared_length is None
 
 
 def test_a_rare_mode_is_never_crowded_out():
@@ -501,10 +516,22 @@ def test_goals_by_new_ways_are_worth_something_to_exploration():
     assert buffer.way_novelty[buffer._running[0, 0]] == 0.0
 
 
-@pytest.mark.parametrize("compared_length", [None, 1.0])
-def test_a_mode_is_shown_a_foreign_trajectory_as_a_way_off_its_route(compared_length):
+def test_off_route_is_what_leaves_the_compared_ends():
+    """What members did before is no route, or the loitering of one would make every place a part of it."""
+    buffer = make_buffer(500, mode_features=[0, 1], compared_length=6.5)
+    loitering = np.array([[0, 0], [4, 5], [6, 4], [5, 3], [3, 2], [0, 1], [1, 0], *straight(8)[2:]], dtype=np.float32)
+    leaves = np.array([[0, 9], [1, 0], [2, 0], [3, 2], [4, 4], [5, 4], [8, 0]], dtype=np.float32)
+    fill(buffer, [straight(8), straight(8), loitering])
+    fill(buffer, [leaves], reward=5.0)
+    *members, foreign = buffer.trajectories(True)
+    buffer.mark_off_route(foreign, members)
+    # 6 m before its end it is far from the last 6.5 m of the others; what it did before nobody can tell
+    assert buffer.off_route[foreign.rows].tolist() == [False, False, False, True, True, False]
+
+
+def test_a_mode_is_shown_a_foreign_trajectory_as_a_way_off_its_route():
     """Up to where it leaves the route it is as any other; from there on it is worth nothing, and the end."""
-    buffer = make_buffer(500, mode_features=[0, 1], compared_length=compared_length)
+    buffer = make_buffer(500, mode_features=[0, 1])
     leaves = np.array([[0, 0], [1, 0], [2, 0], [3, 2], [4, 4], [5, 4], [8, 0]], dtype=np.float32)
     fill(buffer, [straight(8)] * 3)
     fill(buffer, [leaves], reward=5.0)
@@ -744,7 +771,7 @@ def test_a_limit_without_handling_of_timeouts_is_terminal():
         ("max_failures_per_mode", -1),
         ("n_path_points", 1),
         ("compared_length", 0.0),
-        ("compared_length", float("nan")),
+        *(("compared_length", value) for value in (float("nan"), float("inf"), "0.3", [0.3], True)),
         ("visit_cell_size", -1.0),
         ("optimize_memory_usage", True),
     ],

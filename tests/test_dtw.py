@@ -165,6 +165,9 @@ def test_resampling_to_one_point_gives_the_first():
 def test_resampling_checks_its_arguments():
     with pytest.raises(ValueError, match="n_points must be at least 1, got 0"):
         resample_path(np.zeros((2, 2)), 0)
+    for arc_length in (0.0, -1.0, np.nan):
+        with pytest.raises(ValueError, match="arc_length must be positive, or None"):
+            resample_path(np.zeros((2, 2)), 3, arc_length)
     with pytest.raises(ValueError, match="path must have shape"):
         resample_path(np.zeros((0, 2)), 3)
     with pytest.raises(ValueError, match="path holds values"):
