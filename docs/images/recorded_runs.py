@@ -1,4 +1,4 @@
-"""Pictures of the recorded runs: success of the commanded ways along training, and in a maze the first run's routes."""
+"""Pictures of DDiffPG's recorded runs: success of the commanded ways along training, and in a maze the first run's routes."""
 
 from pathlib import Path
 
@@ -15,6 +15,14 @@ from sb3_ddiffpg.episodes import run_episodes
 RESULTS = Path(__file__).parents[2] / "results"
 N_EPISODES = 20
 ANT, ARM = "AntMaze", "Franka"
+
+
+def recorded(env_id: str) -> list[Path]:
+    """
+    :param env_id: Of an environment
+    :return: The folders of its runs, those of baselines left out
+    """
+    return sorted((RESULTS / env_id).glob("seed*"))
 
 
 def draw_curves(steps: Axes, hours: Axes, runs: list[Path], ways: tuple[str, ...]) -> None:
@@ -44,7 +52,7 @@ def draw_ant(env_id: str) -> Figure:
     """
     figure = Figure(figsize=(14, 4.2), layout="constrained")
     steps, hours, routes = figure.subplots(1, 3, width_ratios=(3, 3, 3.4))
-    runs = sorted((RESULTS / env_id).iterdir())
+    runs = recorded(env_id)
     env = make_vec_env(env_id, N_EPISODES, seed=0, start_noise=0.0, integrator="euler")
     draw_curves(steps, hours, runs, env.get_attr("listed_modes")[0])
     model = DDiffPG.load(runs[0] / "model.zip")
@@ -64,7 +72,7 @@ def draw_arm(env_ids: list[str]) -> Figure:
     figure = Figure(figsize=(9.5, 3.2 * len(env_ids)), layout="constrained")
     for env_id, (steps, hours) in zip(env_ids, np.atleast_2d(figure.subplots(len(env_ids), 2)), strict=True):
         env = make_vec_env(env_id, 1)
-        draw_curves(steps, hours, sorted((RESULTS / env_id).iterdir()), env.get_attr("listed_modes")[0])
+        draw_curves(steps, hours, recorded(env_id), env.get_attr("listed_modes")[0])
         env.close()
         steps.set_title(env_id)
     return figure
