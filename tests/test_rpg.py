@@ -3,11 +3,13 @@
 from collections import defaultdict
 from itertools import pairwise
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from environments import TwoEnds
 from scipy.stats import norm
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -153,3 +155,48 @@ def test_an_episode_keeps_its_latent_variable():
 def test_values_are_scalar():
     with pytest.raises(ValueError, match="n_atoms must be 1"):
         small(n_atoms=51)
+
+
+class TwoArms(gym.Env):
+    """A bandit whose reward has two equal peaks, at actions of -0.6 and 0.6."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        reward = float(np.exp(-0.5 * ((abs(action[0]) - 0.6) / 0.2) ** 2))
+        return np.zeros(1, np.float32), reward, True, False, {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_it_keeps_both_arms_of_a_bandit(seed):
+    """
+    What actions tell about z spreads them over all that there is; with less and less of it they gather at the arms, at both. A
+    policy without it ends at one arm. An even spread would have 0.15 of its actions at each.
+    """
+    settings = {"n_steps": 1, "gamma": 0.0, "v_min": -10.0, "v_max": 10.0, "intrinsic_coef": 0.0, "target_entropy": -2.0}
+    model = RPG(
+        "MlpPolicy",
+        make_vec_env(TwoArms, 8, seed=seed),
+        learning_starts=200,
+        train_freq=1,
+        gradient_steps=8,
+        batch_size=256,
+        learning_rate=3e-3,
+        latent_dim=3,
+        policy_kwargs={"net_arch": [64, 64], "state_dim": 16},
+        buffer_size=20_000,
+        seed=seed,
+        **settings,
+    )
+    for latent_coef in np.linspace(0.8, 0.125, 10):
+        model.latent_coef = float(latent_coef)
+        model.learn(1200, reset_num_timesteps=False)
+    actions = model.policy.predict(np.zeros((400, 1), np.float32), episode_start=np.ones(400, dtype=bool))[0][:, 0]
+    left, right = (np.mean(np.abs(actions - arm) < 0.15) for arm in (-0.6, 0.6))
+    assert min(left, right) > 0.3 and left + right > 0.75, (left, right)
