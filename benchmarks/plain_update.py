@@ -114,7 +114,7 @@ class PlainUpdate:
         :param batch_size: Transitions over all groups
         """
         model, policy = self.model, self.model.policy
-        batch = model.replay_buffer.sample_modes(batch_size, model.gamma, model.exploration_n_steps, model.mode_n_steps)
+        batch = model._sample_modes(batch_size)
         n_groups, n = batch.rows.shape
         positions = model.replay_buffer.features.of_tensors(model.replay_buffer.read_observations(batch.rows[0])[1])
         features = policy.critic_features(batch.observations).detach()

@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
-from sb3_ddiffpg.dtw import erase_loops, resample_path
+from sb3_ddiffpg.dtw import LOOP_SHARE, N_PATH_POINTS, comparable_path
 from sb3_ddiffpg.features import ModeFeatures
 from sb3_ddiffpg.intrinsic import cell_entries
 from sb3_ddiffpg.row_storage import Fields
@@ -44,15 +44,20 @@ class ModeBatch(NamedTuple):
     windows: np.ndarray
 
 
-# Defaults of the paths that are compared
-N_PATH_POINTS, LOOP_SHARE = 48, 0.05
-
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
     *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct"),
     *("compared_length", "loop_share", "route_share"),
     *("new_way_share", "explore_beyond_goals", "visit_cell_size"),
 )
+
+
+def _positive_length(name: str, length: Any) -> float | None:
+    if length is None:
+        return None
+    if not isinstance(length, Real) or isinstance(length, bool) or not 0 < float(length) < np.inf:
+        raise ValueError(f"{name} must be a positive and finite number, or None, got {length!r}")
+    return float(length)
 
 
 class ModeReplayBuffer(TrajectoryReplayBuffer):
@@ -143,18 +148,12 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.min_direct = min_direct
         self.n_path_points = n_path_points
         self.normalize_distances = normalize_distances
-        self.compared_length = compared_length
+        self.compared_length = _positive_length("compared_length", compared_length)
         self.loop_share = loop_share
         self.route_share = route_share
         self.new_way_share = new_way_share
         self.explore_beyond_goals = explore_beyond_goals
-        self.visit_cell_size = visit_cell_size
-        for name in ("compared_length", "visit_cell_size"):
-            length = getattr(self, name)
-            is_number = isinstance(length, Real) and not isinstance(length, bool)
-            if length is not None and not (is_number and 0 < length < float("inf")):
-                raise ValueError(f"{name} must be a positive and finite number, or None, got {length!r}")
-            setattr(self, name, None if length is None else float(length))
+        self.visit_cell_size = _positive_length("visit_cell_size", visit_cell_size)
         super().__init__(
             buffer_size,
             observation_space,
@@ -326,8 +325,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         if self._feature_scale is None:
             self._feature_scale = self._measure_scale()
         path = full_path / self._feature_scale
-        path = erase_loops(path, self.loop_share * float(np.linalg.norm(np.ptp(path, axis=0))))
-        return resample_path(path, self.n_path_points, self.compared_length)
+        return comparable_path(path, self.n_path_points, self.loop_share, self.compared_length)
 
     def _forget_paths(self) -> None:
         """What is compared has changed."""

@@ -387,7 +387,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             self.exploration_n_steps,
             self.mode_n_steps,
             env=self._vec_normalize_env,
-            exploration_gamma=self._exploration_gamma(),
+            exploration_gamma=self.exploration_gamma,
         )
 
     def _critic_names(self) -> list[str]:

@@ -14,6 +14,10 @@ LANES = 16
 _FLOAT_FLAGS = {"contract", "nnan", "nsz"}
 
 
+# Defaults of what is compared
+N_PATH_POINTS, LOOP_SHARE = 48, 0.05
+
+
 def erase_loops(path: np.ndarray, radius: float) -> np.ndarray:
     """
     The path without its loops: from each point it goes on where the path was last within ``radius`` of that point. Wandering
@@ -56,6 +60,22 @@ def resample_path(path: np.ndarray, n_points: int, arc_length: float | None = No
     moved = np.concatenate([[True], np.diff(travelled) > 0.0])
     columns = [np.interp(targets, travelled[moved], column) for column in points[moved].T]
     return np.stack(columns, axis=1).astype(np.float32)
+
+
+def comparable_path(
+    path: np.ndarray, n_points: int = N_PATH_POINTS, loop_share: float = LOOP_SHARE, arc_length: float | None = None
+) -> np.ndarray:
+    """
+    What clustering compares of a path: without its loops, resampled.
+
+    :param path: shape ``[length, dims]``
+    :param n_points: see ``resample_path``
+    :param loop_share: radius of ``erase_loops``, as a share of the path's extent
+    :param arc_length: see ``resample_path``
+    :return: shape ``[n_points, dims]``
+    """
+    extent = float(np.linalg.norm(np.ptp(path, axis=0)))
+    return resample_path(erase_loops(path, loop_share * extent), n_points, arc_length)
 
 
 def dtw_distances(

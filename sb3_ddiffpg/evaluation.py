@@ -14,9 +14,9 @@ from scipy.stats import binomtest
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_ddiffpg.buffers import LOOP_SHARE, N_PATH_POINTS, ModeReplayBuffer
+from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.clustering import cluster
-from sb3_ddiffpg.dtw import dtw_distances, erase_loops, resample_path
+from sb3_ddiffpg.dtw import comparable_path, dtw_distances
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.episodes import EpisodeResult, run_episodes
 from sb3_ddiffpg.rng import preserved_rng
@@ -399,9 +399,8 @@ def _labels(model: Any, runs: list[list[EpisodeResult]]) -> tuple[list[list[str 
         if full[0].shape[1] > 3:  # a whole observation, whose components have scales of their own
             scale = np.maximum(np.concatenate(full).std(axis=0), 1e-6)
             full = [path / scale for path in full]
-        short = [erase_loops(path, LOOP_SHARE * float(np.linalg.norm(np.ptp(path, axis=0)))) for path in full]
         compared_length = getattr(buffer, "compared_length", None)
-        paths, normalize, linkage = [resample_path(path, N_PATH_POINTS, compared_length) for path in short], True, "average"
+        paths, normalize, linkage = [comparable_path(path, arc_length=compared_length) for path in full], True, "average"
     threshold, min_size = getattr(model, "distance_threshold", None), 1 if len(paths) < 3 else 3
     numbers = iter(cluster(dtw_distances(paths, normalize=normalize), threshold, linkage, min_size=min_size))
     names = [[_cluster_name(next(numbers)) if _reached(episode) else None for episode in run] for run in runs]

@@ -179,10 +179,15 @@ def test_it_keeps_both_arms_of_a_bandit(seed):
     What actions tell about z spreads them over all that there is; with less and less of it they gather at the arms, at both. A
     policy without it ends at one arm. An even spread would have 0.15 of its actions at each.
     """
-    settings = {"n_steps": 1, "gamma": 0.0, "v_min": -10.0, "v_max": 10.0, "intrinsic_coef": 0.0, "target_entropy": -2.0}
     model = RPG(
         "MlpPolicy",
         make_vec_env(TwoArms, 8, seed=seed),
+        n_steps=1,
+        gamma=0.0,
+        v_min=-10.0,
+        v_max=10.0,
+        intrinsic_coef=0.0,
+        target_entropy=-2.0,
         learning_starts=200,
         train_freq=1,
         gradient_steps=8,
@@ -192,7 +197,6 @@ def test_it_keeps_both_arms_of_a_bandit(seed):
         policy_kwargs={"net_arch": [64, 64], "state_dim": 16},
         buffer_size=20_000,
         seed=seed,
-        **settings,
     )
     for latent_coef in np.linspace(0.8, 0.125, 10):
         model.latent_coef = float(latent_coef)

@@ -27,7 +27,7 @@ def trained_model(**changes):
 
 
 def draw(model, batch_size=60):
-    return model.replay_buffer.sample_modes(batch_size, model.gamma, model.exploration_n_steps, model.mode_n_steps)
+    return model._sample_modes(batch_size)
 
 
 def parameters_of(module):
