@@ -1,9 +1,12 @@
 """What became of the modes in the course of a run."""
 
 import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, astuple, dataclass
 from typing import Any
+
+import msgspec
 
 from sb3_ddiffpg.clustering import Inheritance
 from sb3_ddiffpg.modes import Mode, default_name
@@ -55,7 +58,11 @@ class ModeState:
     success_rate: float
 
 
-@dataclass
+class _State(msgspec.Struct, forbid_unknown_fields=True):
+    events: list[ModeEvent]
+    states: list[ModeState]
+
+
 class ModeHistory:
     """
     All events of a run, and every mode's state at each re-clustering. Iterate over the events, or print them.
@@ -64,21 +71,34 @@ class ModeHistory:
     :param states: In order of time
     """
 
-    events: list[ModeEvent] = field(default_factory=list)
-    states: list[ModeState] = field(default_factory=list)
+    def __init__(self, events: Iterable[ModeEvent] = (), states: Iterable[ModeState] = ()) -> None:
+        self.events = list(events)
+        # A long run has a hundred thousand states: a column of numbers for each field, a tenth of the objects' memory
+        self._columns: list[array[Any]] = [array("q"), array("q"), array("q"), array("d")]
+        self._append(states)
+
+    @property
+    def states(self) -> list[ModeState]:
+        """In order of time; made anew when asked for."""
+        return [ModeState(*row) for row in zip(*self._columns, strict=True)]
+
+    def _append(self, states: Iterable[ModeState]) -> None:
+        for state in states:
+            for column, value in zip(self._columns, astuple(state), strict=True):
+                column.append(value)
 
     def note(self, step: int, modes: Sequence[Mode]) -> None:
         """
         :param step: Environment steps so far
         :param modes: The modes at a re-clustering
         """
-        self.states += [ModeState(step, mode.number, mode.n_trajectories, mode.success_rate) for mode in modes]
+        self._append(ModeState(step, mode.number, mode.n_trajectories, mode.success_rate) for mode in modes)
 
     def state_dict(self) -> dict[str, Any]:
         """
         :return: All of it, for ``from_state``
         """
-        return asdict(self)
+        return {"events": [asdict(event) for event in self.events], "states": [asdict(state) for state in self.states]}
 
     @classmethod
     def from_state(cls, state: Any) -> "ModeHistory":
@@ -87,11 +107,14 @@ class ModeHistory:
         :return: The same history
         :raises ValueError: If it is something else
         """
-        history = convert(state, cls, "history")
-        unknown = {event.kind for event in history.events} - set(EVENT_KINDS)
+        known = convert(state, _State, "history")
+        unknown = {event.kind for event in known.events} - set(EVENT_KINDS)
         if unknown:
             raise ValueError(f"history: nothing that can happen to a mode is called {sorted(unknown)}")
-        return history
+        try:
+            return cls(known.events, known.states)
+        except OverflowError:
+            raise ValueError("history: a number of a state is beyond 64 bits") from None
 
     def share_kept(self, min_trajectories: int = 20, from_step: int = 0) -> float:
         """

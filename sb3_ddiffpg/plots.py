@@ -350,12 +350,13 @@ def plot_success(history: ModeHistory, names: Mapping[int, str] | None = None) -
     :param names: Names by number
     :return: The figure
     """
-    if not history.states:
+    states = history.states
+    if not states:
         return _empty("no re-clustering yet")
     figure = _new(9, 3.6)
     axes = figure.subplots()
-    for number in sorted({state.number for state in history.states}):
-        own = [state for state in history.states if state.number == number]
+    for number in sorted({state.number for state in states}):
+        own = [state for state in states if state.number == number]
         known = names is None or number in names
         axes.plot(
             [state.step for state in own],

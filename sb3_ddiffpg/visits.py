@@ -36,7 +36,7 @@ class VisitMap:
             raise ValueError(f"cell_size must be positive, got {cell_size}")
         self.dim, self.cell_size = dim, cell_size
         self._counts: Counter[int] = Counter()
-        #: Environment steps and known cells, from time to time
+        #: Environment steps and known cells, from time to time; while nothing new is found, when that began and the latest
         self.coverage: list[tuple[int, int]] = []
 
     def __len__(self) -> int:
@@ -57,6 +57,9 @@ class VisitMap:
         """
         :param step: Environment steps so far
         """
+        latest = [known for _, known in self.coverage[-2:]]
+        if latest == [len(self)] * 2:
+            self.coverage.pop()
         self.coverage.append((step, len(self)))
 
     def cells(self) -> tuple[np.ndarray, np.ndarray]:

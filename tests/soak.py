@@ -24,6 +24,15 @@ ALLOWED = {"memory_mb": 0.02, "files": 0.0, "threads": 0.0, "processes": 0.0, "c
 RESOLUTION = 0.1
 
 
+def memory_mb(process: psutil.Process) -> float:
+    """
+    :param process: Of this machine
+    :return: MiB that hold its data. Not those of files: a library's pages are a process's own as soon as no other has it open
+    """
+    memory = process.memory_info()
+    return (memory.rss - getattr(memory, "shared", 0)) / 2**20
+
+
 class Watch(BaseCallback):
     """
     Measures the process from time to time.
@@ -54,7 +63,7 @@ class Watch(BaseCallback):
             return
         now = self._cpu_seconds()
         sample = {
-            "memory_mb": self.process.memory_full_info().uss / 2**20,
+            "memory_mb": memory_mb(self.process),
             "files": self.process.num_fds(),
             "threads": self.process.num_threads(),
             "processes": len(self.process.children(recursive=True)),

@@ -1,5 +1,7 @@
 """What a user does with modes: rename, freeze, delete, filter, choose by value, and read what became of them."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import torch as th
@@ -11,6 +13,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import DDiffPG, Mode, reclustering
+from sb3_ddiffpg.history import ModeHistory
 from sb3_ddiffpg.modes import Outcome
 
 # ---------------------------------------------------------------------- names
@@ -242,6 +245,26 @@ def test_history(two_routes):
     assert states[2].success_rate == 0.5 and states[2].n_trajectories == model.modes[0].n_trajectories
     assert str(model.mode_history).splitlines()[0].split() == ["0", "mode_0", "born"]
     assert "nothing has happened" in str(planar_model().mode_history)
+
+
+def test_a_long_history_is_small():
+    history, modes = ModeHistory(), [Mode(number, f"mode_{number}", born_at=0) for number in range(2)]
+    modes[0].outcomes.append(Outcome(True, 1.0, 5))
+    tracemalloc.start()
+    try:
+        for step in range(5_000):
+            history.note(step, modes)
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held / len(history.states) < 50 and len(history.states) == 10_000
+    assert ModeHistory.from_state(history.state_dict()).states[-2:-1] == history.states[-2:-1] != []
+
+
+def test_a_history_of_impossible_numbers_is_refused():
+    state = {"step": 2**70, "number": 0, "n_trajectories": 1, "success_rate": 1.0}
+    with pytest.raises(ValueError, match="history"):
+        ModeHistory.from_state({"events": [], "states": [state]})
 
 
 # ---------------------------------------------------------------------- choosing

@@ -1,7 +1,9 @@
 """The soak itself takes half an hour (``make soak``); that it would notice a leak is tested here."""
 
+import numpy as np
+import psutil
 import pytest
-from soak import ALLOWED, N_SAMPLES, grown
+from soak import ALLOWED, N_SAMPLES, grown, memory_mb
 
 
 @pytest.mark.parametrize("name", ALLOWED)
@@ -12,3 +14,17 @@ def test_what_grows_is_told(name):
     assert len(grown(leaking)) == 1 and grown(leaking)[0].startswith(f"{name}: 114.5 in the second quarter, 134.5")
     filling = [sample | {name: min(100.0, 10.0 * i)} for i, sample in enumerate(flat)]
     assert grown(filling) == []
+
+
+@pytest.mark.skipif(not psutil.LINUX, reason="elsewhere, a process's shared memory is not told apart")
+def test_memory_is_data_not_files(tmp_path):
+    process, megabytes = psutil.Process(), 64
+    path = tmp_path / "library"
+    path.write_bytes(bytes(megabytes * 2**20))
+    before = memory_mb(process)
+    mapped = np.memmap(path, mode="r")
+    assert mapped.max() == 0  # all of its pages are in memory now
+    assert memory_mb(process) - before < megabytes / 4
+    data = np.ones(megabytes * 2**20, dtype=np.uint8)
+    assert memory_mb(process) - before > megabytes * 3 / 4
+    del mapped, data

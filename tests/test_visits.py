@@ -30,6 +30,19 @@ def test_like_counting_by_hand(positions, cell_size):
     assert len(visits) == len(expected)
 
 
+@given(st.lists(st.integers(0, 2), max_size=40))
+def test_coverage_keeps_its_curve_and_no_more(gains):
+    visits, noted = VisitMap(1, 1.0), []
+    for step, gain in enumerate(gains):
+        visits.observe(np.arange(len(visits) + gain, dtype=float).reshape(-1, 1))
+        visits.note(step)
+        noted.append((step, len(visits)))
+    if noted:
+        steps, known = zip(*noted, strict=True)
+        np.testing.assert_allclose(np.interp(steps, *zip(*visits.coverage, strict=True)), known)
+    assert len(visits.coverage) <= 2 * (1 + len(visits))
+
+
 def test_a_run_counts_where_it_has_been(tmp_path):
     model = small_model(DummyVecEnv([TwoEnds] * 4)).learn(400)
     assert model.visits.cells()[1].sum() == model.num_timesteps
