@@ -487,10 +487,9 @@ class NoveltyActorCritic(SavableAlgorithm):
 
     def _store_transition(self, replay_buffer: ModeReplayBuffer, *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
         super()._store_transition(replay_buffer, *args, **kwargs)
-        positions = replay_buffer.last_positions()
-        self.novelty_model.observe(th.as_tensor(positions, device=self.device))
+        self.novelty_model.observe(th.as_tensor(replay_buffer.counted_positions(), device=self.device))
         if self.visits is not None:
-            self.visits.observe(positions)
+            self.visits.observe(replay_buffer.last_positions())
         for _, trajectory in replay_buffer.just_finished:
             self._warn_outside_support(trajectory)
 

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 
 from sb3_ddiffpg.buffers import ModeReplayBuffer
+from sb3_ddiffpg.known_ways import Way
 from sb3_ddiffpg.row_storage import HostRows
 from sb3_ddiffpg.safe_files import check_array, convert
 from sb3_ddiffpg.trajectories import NO_MODE, RowSet, Trajectory
@@ -33,6 +34,11 @@ class _Group(msgspec.Struct, forbid_unknown_fields=True):
     members: np.ndarray
 
 
+class _Way(msgspec.Struct, forbid_unknown_fields=True):
+    paths: np.ndarray
+    radius: float
+
+
 class _Buffer(msgspec.Struct, forbid_unknown_fields=True):
     layouts: list[str]
     parts: list[np.ndarray]
@@ -55,6 +61,7 @@ class _Buffer(msgspec.Struct, forbid_unknown_fields=True):
     n_path_points: int
     feature_scale: np.ndarray | None
     last_positions: np.ndarray
+    known_ways: list[_Way]
     serials: np.ndarray
     distances: np.ndarray
     compared_length: float | None = None
@@ -120,6 +127,7 @@ def buffer_state(buffer: ModeReplayBuffer) -> dict[str, Any] | None:
         "n_path_points": buffer.n_path_points,
         "feature_scale": buffer._feature_scale,
         "last_positions": buffer._last_positions,
+        "known_ways": [{"paths": way.paths, "radius": way.radius} for way in buffer.known_ways.ways],
         "serials": buffer._distances.serials,
         "distances": buffer._distances.distances,
         **{name: getattr(buffer, name) for name in _OF_DISTANCES},
@@ -169,6 +177,7 @@ def restore_buffer(buffer: ModeReplayBuffer, tree: Any) -> None:
     buffer._feature_scale, buffer._last_positions = state.feature_scale, state.last_positions
     if all(getattr(state, name) == getattr(buffer, name) for name in _OF_DISTANCES):  # else they are of other paths
         buffer._distances.serials, buffer._distances.distances = state.serials, state.distances
+    buffer.known_ways.replace([Way(way.paths, way.radius) for way in state.known_ways])
     buffer.recall_places()
 
 
@@ -251,6 +260,10 @@ def _check_arrays(buffer: ModeReplayBuffer, state: _Buffer) -> None:
         ("running_return", state.running_return, np.float64, [buffer.n_envs]),
         ("retired", state.retired, np.int64, [None]),
         ("last_positions", state.last_positions, np.float32, [buffer.n_envs, buffer.features.dim]),
+        *(
+            (f"known_ways[{i}]", way.paths, np.float32, [None, buffer.n_path_points, buffer.features.dim])
+            for i, way in enumerate(state.known_ways)
+        ),
         ("serials", state.serials, np.int64, [None]),
         ("distances", state.distances, np.float32, [n_known, n_known]),
         *((f"mode_rows[{i}]", rows, np.int32, [None]) for i, rows in enumerate(state.mode_rows)),

@@ -14,6 +14,7 @@ from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
 from sb3_ddiffpg.dtw import LOOP_SHARE, N_PATH_POINTS, comparable_path
 from sb3_ddiffpg.features import ModeFeatures
 from sb3_ddiffpg.intrinsic import cell_entries
+from sb3_ddiffpg.known_ways import KnownWays, Way
 from sb3_ddiffpg.row_storage import Fields
 from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, Trajectory
 from sb3_ddiffpg.trajectory_buffer import TrajectoryReplayBuffer
@@ -60,6 +61,11 @@ def _positive_length(name: str, length: Any) -> float | None:
     return float(length)
 
 
+def _extent(positions: np.ndarray) -> float:
+    """Diagonal of the box round positions of shape [..., dim]."""
+    return float(np.linalg.norm(np.ptp(positions.reshape(-1, positions.shape[-1]), axis=0)))
+
+
 class ModeReplayBuffer(TrajectoryReplayBuffer):
     """
     A ``TrajectoryReplayBuffer`` whose trajectories belong to modes. Each row has two target actions: one for the mode that
@@ -103,6 +109,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     way_novelty: np.ndarray
     goals: np.ndarray
     first_visits: np.ndarray
+    followed: np.ndarray
 
     def __init__(
         self,
@@ -179,6 +186,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.mode_rows: list[RowSet] = []
         self._new_way_rows = np.empty(0, dtype=np.int32)
         self._episode_places: list[set[int]] = [set() for _ in range(self.n_envs)]
+        self.known_ways = KnownWays(self.n_envs)
+        self._last_followed = self.known_ways.followed.copy()
 
     def _step_fields(self) -> Fields:
         action = ((self.action_dim,), np.float32)
@@ -186,12 +195,12 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
 
     def _note_fields(self) -> Fields:
         own: Fields = {"foreign": ((), bool), "off_route": ((), bool), "way_novelty": ((), np.float32), "goals": ((), bool)}
-        own["first_visits"] = (), bool
+        own["first_visits"] = own["followed"] = (), bool
         return {**super()._note_fields(), **own}
 
     def _view_names(self) -> list[str]:
         own = ["target_actions", "exploratory_target_actions", "foreign", "off_route", "way_novelty", "goals"]
-        return [*super()._view_names(), *own, "first_visits"]
+        return [*super()._view_names(), *own, "first_visits", "followed"]
 
     def _position_arrays(self) -> list[np.ndarray]:
         return [*super()._position_arrays(), self._mode_position]
@@ -202,7 +211,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.exploratory_target_actions = self._steps["exploratory_target_actions"]
         self.foreign, self.off_route = self._notes["foreign"], self._notes["off_route"]
         self.way_novelty, self.goals = self._notes["way_novelty"], self._notes["goals"]
-        self.first_visits = self._notes["first_visits"]
+        self.first_visits, self.followed = self._notes["first_visits"], self._notes["followed"]
         self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
         for row_set in self.mode_rows:
             row_set.position = self._mode_position
@@ -219,6 +228,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             self._steps.write(name, rows, action)
         self.foreign[rows] = self.off_route[rows] = self.goals[rows] = False
         self.way_novelty[rows] = 0.0
+        if self.known_ways.ways:
+            self.known_ways.observe(np.arange(self.n_envs), self._last_positions / self._measured_scale())
+        self._last_followed = self.followed[rows] = self.known_ways.followed.copy()
         if self.visit_cell_size is None:
             self.first_visits[rows] = True
             return
@@ -234,8 +246,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     def drop_unfinished_episodes(self) -> None:
         """Forget the transitions of running episodes: call it when the environments were reset outside."""
         super().drop_unfinished_episodes()
-        for seen in self._episode_places:
+        for env, seen in enumerate(self._episode_places):
             seen.clear()
+            self.known_ways.forget(env)
 
     def recall_places(self) -> None:
         """After loading: where the running episodes have been."""
@@ -244,11 +257,20 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             if length and self.visit_cell_size is not None:
                 rows = self._running[env, :length]
                 seen.update(self._places(self._positions(self._nexts, "next_observations", rows)))
+        self._recall_ways()
+
+    def _recall_ways(self) -> None:
+        envs = np.repeat(np.arange(self.n_envs), self._running_length)
+        if self.known_ways.ways and len(envs):
+            rows = np.concatenate([self._running[env, :length] for env, length in enumerate(self._running_length)])
+            reached = self._positions(self._nexts, "next_observations", rows)
+            self.known_ways.observe(envs, reached / self._measured_scale())
 
     def _finish(self, env: int, info: dict[str, Any]) -> Trajectory:
         trajectory = super()._finish(env, info)
         self.goals[trajectory.rows[-1]] = trajectory.success
         self._episode_places[env].clear()
+        self.known_ways.forget(env)
         return trajectory
 
     def _evict(self) -> Trajectory:
@@ -266,6 +288,12 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :return: Mode features of the states reached by the latest ``add``, shape [n_envs, dim]
         """
         return self._last_positions
+
+    def counted_positions(self) -> np.ndarray:
+        """
+        :return: Those of ``last_positions`` whose visits count: not of an episode that came along a known way
+        """
+        return self._last_positions[~self._last_followed]
 
     def expect_modes(self, n_modes: int) -> None:
         """
@@ -322,9 +350,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param full_path: Mode features along a trajectory, shape [L, dim]
         :return: What clustering compares, shape [n_path_points, dim]
         """
-        if self._feature_scale is None:
-            self._feature_scale = self._measure_scale()
-        path = full_path / self._feature_scale
+        path = full_path / self._measured_scale()
         return comparable_path(path, self.n_path_points, self.loop_share, self.compared_length)
 
     def _forget_paths(self) -> None:
@@ -346,6 +372,11 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     def _positions(self, part: Any, name: str, rows: np.ndarray) -> np.ndarray:
         """Mode features at the rows, shape [N, dim]."""
         return self.features.of_tensors(self._as_observation(part.tensors(rows), name)).cpu().numpy()
+
+    def _measured_scale(self) -> np.ndarray:
+        if self._feature_scale is None:
+            self._feature_scale = self._measure_scale()
+        return self._feature_scale
 
     def _measure_scale(self) -> np.ndarray:
         """Declared positions keep their unit; a whole observation is standardised once, or cached distances would age."""
@@ -419,6 +450,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             self.way_novelty[trajectory.rows[-1]] = 0.0
             self._retired.append(trajectory)
         new_ways = [trajectory.rows for trajectory in stays if self.way_novelty[trajectory.rows[-1]] > 0]
+        for rows in new_ways:  # along a known way for long, but on to a new one
+            self.followed[rows] = False
         self._new_way_rows = np.concatenate([self._new_way_rows[:0], *new_ways])
 
     def places_of(self, modes: Collection[int]) -> th.Tensor:
@@ -430,6 +463,17 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         if not rows:
             return th.empty(0, self.features.dim)
         return self.features.of_tensors(self.read_observations(np.concatenate(rows))[1])
+
+    def watch_ways(self, modes: Collection[int]) -> None:
+        """
+        Note from now on which steps are of episodes that have come along the way of one of these modes: ``followed``.
+
+        :param modes: Indices of modes
+        """
+        members = [[each for each in self.trajectories(success=True) if each.trains and each.mode == mode] for mode in modes]
+        paths = [np.stack([self.path(each) for each in those]) for those in members if those]
+        self.known_ways.replace([Way(each, self.route_share * _extent(each)) for each in paths])
+        self._recall_ways()
 
     def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:
         """
@@ -458,7 +502,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         route = np.concatenate([self.path(member) for member in members])
         full_path = self.full_path(trajectory) / self._feature_scale
         reached = full_path[1:]
-        extent = float(np.linalg.norm(np.ptp(route, axis=0)))
+        extent = _extent(route)
         off_route = cdist(reached, route).min(axis=1) > self.route_share * extent
         if self.compared_length is not None:  # the members' routes before that are not known
             steps = np.linalg.norm(np.diff(full_path, axis=0), axis=1)
@@ -538,6 +582,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             # for ends it, or it would be paid again and again
             unpaid = notes["goals"] & ~((notes["way_novelty"] > 0) & (self.new_way_share > 0))
             ended[EXPLORATORY_GROUP] &= ~np.take_along_axis(unpaid, ends, axis=-1)[EXPLORATORY_GROUP, :, 0]
+        # Nor is what lies past a known way worth anything to explorers who came along it
+        ended[EXPLORATORY_GROUP] |= (notes["followed"] & present)[EXPLORATORY_GROUP].any(axis=-1)
         discounts = gammas**lengths * ~(ended | lost.any(axis=-1))
         steps = self._on_device(self._steps.tensors(rows.ravel()))
         nexts = self._on_device(self._nexts.tensors(last))

@@ -122,6 +122,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         section 3): otherwise explorers stand where fewest have been
     :param explore_off_modes: Whether explorers are paid nothing for places where the trajectories of the modes go that reach
         the goal in half of their episodes, so that another way pays where it leaves the known ones, not only where it ends
+    :param explore_past_modes: Whether what lies past such a mode's way is worth anything to an explorer that came along it. If
+        not, its visits there do not count either: what is new by another way stays new
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
     :param max_grad_norm: Largest gradient norm of the policy and of each mode's critics
@@ -211,6 +213,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         intrinsic_clip: float = 10.0,
         episodic_novelty: bool = True,
         explore_off_modes: bool = True,
+        explore_past_modes: bool = False,
         reset_new_critics: bool = True,
         max_grad_norm: float = 1.0,
         control: str | None = None,
@@ -291,6 +294,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         self.explore_then_exploit = explore_then_exploit
         self.explore_beyond_goals = explore_beyond_goals
         self.explore_off_modes = explore_off_modes
+        self.explore_past_modes = explore_past_modes
         self.mode_intrinsic_coef = mode_intrinsic_coef
         self.new_way_coef = new_way_coef
         self.reset_new_critics = reset_new_critics
@@ -406,10 +410,15 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
 
     def _pays(self, windows: np.ndarray, present: np.ndarray, positions: th.Tensor) -> th.Tensor:
         pays = super()._pays(windows, present, positions)
-        if self.explore_off_modes and self._modes:
+        if not self._modes:
+            return pays
+        explores = np.nonzero(present)[0] == EXPLORATORY_GROUP
+        past = th.from_numpy(explores & self.replay_buffer.followed[windows[present]])
+        pays = pays & ~past.to(self.device, non_blocking=True)
+        if self.explore_off_modes:
             # What a mode knows is not new, or explorers would follow it to what lies beyond
-            explores = th.from_numpy(np.nonzero(present)[0] == EXPLORATORY_GROUP).to(self.device, non_blocking=True)
-            pays = pays & ~(explores & self.known_places.contain(positions))
+            there = th.from_numpy(explores).to(self.device, non_blocking=True)
+            pays = pays & ~(there & self.known_places.contain(positions))
         return pays
 
     def recluster(self) -> list[ModeEvent]:
@@ -419,10 +428,12 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         :return: What happened: births, splits, merges and retirements
         """
         events = super().recluster()
+        # What a young mode cannot do yet, explorers must go on with
+        able = [index for index, mode in enumerate(self._modes) if mode.success_rate >= ABLE]
         if self.explore_off_modes:
-            # What a young mode cannot do yet, explorers must go on with
-            able = [index for index, mode in enumerate(self._modes) if mode.success_rate >= ABLE]
             self.known_places.replace(self.replay_buffer.places_of(able))
+        if not self.explore_past_modes:
+            self.replay_buffer.watch_ways(able)
         return events
 
     def _row_embeddings(self, batch: ModeBatch, masked: bool) -> th.Tensor:

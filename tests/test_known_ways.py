@@ -1,0 +1,174 @@
+"""Which episodes have come along a mode's way, against going through their positions one by one, and what follows from it."""
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import torch as th
+from environments import fill
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planar import planar_model, walk
+from test_intrinsic import make_able
+
+from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
+from sb3_ddiffpg.buffer_state import buffer_state, restore_buffer
+from sb3_ddiffpg.buffers import ModeReplayBuffer
+from sb3_ddiffpg.known_ways import KnownWays, Way
+
+LINE, ACTION = spaces.Box(-np.inf, np.inf, (1,)), spaces.Box(-1.0, 1.0, (1,))
+
+
+def slow_followed(ways, positions):
+    """Whether an episode that was at these positions came through eight tenths of one of the ways."""
+    for way in ways:
+        parts = set()
+        for position in positions:
+            nearest = min(
+                (float(np.linalg.norm(point - position)), number) for path in way.paths for number, point in enumerate(path)
+            )
+            if nearest[0] < way.radius:
+                parts.add(nearest[1] * 10 // way.paths.shape[1])
+        if len(parts) >= 8:
+            return True
+    return False
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 2))
+def test_followed_as_told_one_by_one(seed, n_ways, dim):
+    rng = np.random.default_rng(seed)
+    n_envs, n_points = 3, 20
+    ways = [Way(rng.normal(size=(2, n_points, dim)).cumsum(axis=1), rng.uniform(0.5, 2.0)) for _ in range(n_ways)]
+    known = KnownWays(n_envs)
+    known.replace(ways)
+    been = [[] for _ in range(n_envs)]
+    for _ in range(25):
+        envs = rng.integers(n_envs, size=4)
+        way = ways[rng.integers(n_ways)].paths[0]
+        positions = way[rng.integers(n_points, size=4)] + rng.normal(scale=0.3, size=(4, dim))
+        known.observe(envs, positions)
+        for env, position in zip(envs, positions, strict=True):
+            been[env].append(position)
+        if rng.random() < 0.1:
+            env = int(rng.integers(n_envs))
+            known.forget(env)
+            been[env] = []
+        np.testing.assert_array_equal(known.followed, [slow_followed(ways, each) for each in been])
+
+
+def test_a_way_with_zeros_where_denormal_numbers_are_flushed():
+    """Training flushes them, see ``set_flush_denormal``: scipy's trees crash the process there."""
+    if not th.set_flush_denormal(True):
+        pytest.skip("this processor does not flush them")
+    try:
+        path = np.append(np.zeros(12), np.linspace(0, 40, 88)).reshape(1, -1, 1).astype(np.float32)
+        known = KnownWays(1)
+        known.replace([Way(np.repeat(path, 20, axis=0), 1.0)])
+        known.observe(np.zeros(40, dtype=int), np.arange(40.0)[:, None])
+        assert known.followed.all()
+    finally:
+        th.set_flush_denormal(False)
+
+
+def line_buffer(n_envs=1, **kwargs):
+    """A buffer with one mode that goes from 0 to 10."""
+    buffer = ModeReplayBuffer(500, LINE, ACTION, device="cpu", n_envs=n_envs, visit_cell_size=1.0, **kwargs)
+    for _ in range(4):
+        for x in range(10):
+            add(buffer, [x] * n_envs, [x + 1] * n_envs, x == 9)
+    successes = buffer.trajectories(True)
+    buffer.assign_modes(successes, np.zeros(len(successes), dtype=int), [], np.zeros(0, dtype=int), [None])
+    return buffer
+
+
+def add(buffer, now, then, done, success=True):
+    n = buffer.n_envs
+    positions = [np.array(each, dtype=np.float32).reshape(n, 1) for each in (now, then)]
+    infos = [{"is_success": done and success}] * n
+    buffer.add(*positions, np.zeros((n, 1)), np.zeros(n), np.full(n, done), infos)
+
+
+def test_an_episode_that_came_along_the_way_is_told_from_one_that_did_not():
+    buffer = line_buffer(n_envs=2)
+    buffer.watch_ways([0])
+    counted = []
+    for step in range(14):  # one goes on past the end, one turns round after two
+        along, away = step + 0.5, min(step + 0.5, 3.5 - step)
+        add(buffer, [step - 0.5, min(step - 0.5, 4.5 - step)], [along, away], step == 13, success=False)
+        counted.append(buffer.counted_positions()[:, 0].tolist())
+    along, away = buffer.trajectories(False)
+    # In the eighth tenth of the way when it comes to 7.5
+    np.testing.assert_array_equal(buffer.followed[along.rows], np.arange(14) >= 7)
+    assert not buffer.followed[away.rows].any()
+    assert [len(each) for each in counted] == [2] * 7 + [1] * 7 and counted[-1] == [-9.5]
+    add(buffer, [0, 0], [1, 1], False)
+    assert len(buffer.counted_positions()) == 2  # the next episode starts anew
+
+
+def test_what_lies_past_the_way_is_worth_nothing_to_explorers_alone():
+    buffer = line_buffer()
+    buffer.watch_ways([0])
+    for step in range(14):
+        add(buffer, [step - 0.5], [step + 0.5], step == 13, success=False)
+    rows = buffer.trajectories(False)[0].rows
+    batch = buffer.sample_modes(4000, 0.9, 3, 1)
+    places = [{int(row): i for i, row in enumerate(group)} for group in batch.rows]
+    for number, row in enumerate(rows[:13]):  # what is followed within three steps ends there
+        expected = 0.0 if number + 2 >= 7 else 0.9**3
+        assert batch.discounts[EXPLORATORY_GROUP, places[EXPLORATORY_GROUP][int(row)]] == pytest.approx(expected)
+    assert (batch.discounts[1] > 0).sum() > 0.8 * len(batch.rows[1])  # a mode's own steps but the last
+
+
+def test_a_new_way_that_leads_on_from_a_known_one_keeps_its_worth():
+    buffer = line_buffer()
+    buffer.watch_ways([0])
+    for step in range(14):
+        add(buffer, [step - 0.5], [step + 0.5], step == 13)
+    newest = max(buffer.trajectories(True), key=lambda each: each.serial)
+    assert buffer.followed[newest.rows].any()
+    successes = buffer.trajectories(True)
+    labels = np.array([-1 if each is newest else 0 for each in successes])
+    buffer.assign_modes(successes, labels, [], np.zeros(0, dtype=int), [0])
+    assert not buffer.followed[newest.rows].any()
+
+
+def test_known_ways_go_on_where_they_were():
+    buffer = line_buffer()
+    buffer.watch_ways([0])
+    for step in range(7):
+        add(buffer, [step - 0.5], [step + 0.5], False)
+    again = ModeReplayBuffer(500, LINE, ACTION, device="cpu", visit_cell_size=1.0)
+    again.mode_rows = list(buffer.mode_rows)
+    restore_buffer(again, buffer_state(buffer))
+    for each in (buffer, again):
+        assert not each.known_ways.followed.any()
+        add(each, [6.5], [7.5], False)
+        assert each.known_ways.followed.all() and len(each.counted_positions()) == 0
+        each.drop_unfinished_episodes()
+        assert not each.known_ways.followed.any()
+
+
+@pytest.mark.parametrize(("explore_past_modes", "able"), [(False, [0]), (False, []), (True, [0])])
+def test_explorers_past_an_able_mode_are_paid_nothing(explore_past_modes, able):
+    settings = {"explore_off_modes": False, "episodic_novelty": False, "normalize_intrinsic": False}
+    model = planar_model(explore_past_modes=explore_past_modes, **settings)
+    walk(model, "up", 6)
+    model.recluster()
+    make_able(model, able)
+    line = np.concatenate([np.linspace((0, 0), (0, 6), 7), np.linspace((1, 6), (18, 6), 18)]).astype(np.float32)
+    fill(model.replay_buffer, [line], False)
+    buffer = model.replay_buffer
+    past = buffer.trajectories(False)[-1].rows[:, None]
+    rewards = model._intrinsic_rewards(np.stack([past, past]), defaultdict(list))
+    stops = not explore_past_modes and bool(able)
+    assert bool((rewards[EXPLORATORY_GROUP, -12:] == 0).all()) is bool(buffer.followed[past].any()) is stops
+    assert (rewards[EXPLORATORY_GROUP, :5] > 0).all() and (rewards[1, -12:] > 0).all()
+
+
+def test_the_paper_pays_past_modes(tmp_path):
+    model = planar_model(explore_past_modes=True)
+    model.save(tmp_path / "model")
+    assert DDiffPG.load(tmp_path / "model").explore_past_modes is True
