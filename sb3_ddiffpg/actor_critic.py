@@ -21,6 +21,7 @@ from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.cuda_graphs import GraphedFunction
 from sb3_ddiffpg.divergence import EXPLODED, DivergenceWatch
+from sb3_ddiffpg.envs.snapshots import NormalizationBackup
 from sb3_ddiffpg.features import declared_cell_size, declared_mode_features, describe_env
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, VisitCounts, noveld_reward
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
@@ -281,6 +282,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         self.graphs = {"critics": GraphedFunction(self._critic_gradients, self.policy, self.policy.critics.optimizer)}
         span = (self.critics.upper - self.critics.lower).max().item()
         self.divergence_watch = DivergenceWatch(self.device, EXPLODED * max(1.0, span**2))
+        self._normalization_backup = NormalizationBackup()
 
     @property
     def critics(self) -> ModeCritics:
@@ -470,6 +472,8 @@ class NoveltyActorCritic(SavableAlgorithm):
     ) -> tuple[np.ndarray, np.ndarray]:
         assert self._last_obs is not None, "self._last_obs was not set"
         # Before the environments are given an action that follows from NaN
+        if self._vec_normalize_env is not None:  # the normalised ones are all NaN if one is
+            self.replay_buffer.check_finite("observation", self._last_original_obs)
         self.replay_buffer.check_finite("observation", self._last_obs)
         shape = (n_envs, *self.action_space.shape)  # type: ignore[misc]
         if self.num_timesteps < learning_starts:
@@ -558,6 +562,7 @@ class NoveltyActorCritic(SavableAlgorithm):
     ) -> tuple[int, BaseCallback]:
         assert self.env is not None, "You must set the environment before calling learn()"
         self._check_buffer(self.env)
+        self._note_normalization()  # the environments may be reset now
         if self._vec_normalize_env is not None and self._vec_normalize_env.norm_reward:
             warnings.warn(
                 "VecNormalize scales the rewards (norm_reward=True), and so the values, which the critics' support "
@@ -604,18 +609,25 @@ class NoveltyActorCritic(SavableAlgorithm):
         or an interrupt: the next ``learn`` then resets the environments, or the running trajectories would have a gap.
         """
         complete = False
+        self._note_normalization()
         try:
             rollout = super().collect_rollouts(*args, **kwargs)
             complete = rollout.continue_training
         finally:
             if not complete:
                 self._last_obs = None
+                if self._vec_normalize_env is not None:
+                    self._normalization_backup.mend(self._vec_normalize_env)
         return rollout
+
+    def _note_normalization(self) -> None:
+        if self._vec_normalize_env is not None:
+            self._normalization_backup.note(self._vec_normalize_env)
 
     # ------------------------------------------------------------------ saving
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "graphs", "divergence_watch"]
+        return [*super()._excluded_save_params(), "actor", "graphs", "divergence_watch", "_normalization_backup"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names = ["policy", "actor.optimizer", "policy.critics.optimizer", "novelty_model", "intrinsic_moments"]

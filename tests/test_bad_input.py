@@ -293,10 +293,26 @@ def test_nan_stops_the_run_and_nothing_stored_is_lost(part, when, learning_start
     assert_no_gaps(model.replay_buffer)
 
 
-def test_nan_behind_a_normalising_wrapper():
-    env = breaking("observation", 20, wrap=lambda env: VecNormalize(env, norm_reward=False))
-    with pytest.raises(ValueError, match="next observation of environment 1 is not finite"):
-        small_model(env).learn(1000)
+@pytest.mark.parametrize(
+    ("part", "when", "norm_reward"),
+    [("observation", 20, False), ("reward", 20, True), ("reset", 1, False), ("reset", 5, False)],
+)
+@pytest.mark.filterwarnings("ignore:VecNormalize scales the rewards", "ignore:invalid value")
+def test_nan_behind_a_normalising_wrapper(part, when, norm_reward):
+    env = breaking(part, when, wrap=lambda env: VecNormalize(env, norm_reward=norm_reward))
+    model, told = small_model(env), []
+
+    def watch(_, __):
+        told.append(env.obs_rms.mean.copy())
+        return True
+
+    with pytest.raises(ValueError, match="environment 1 is not finite"):
+        model.learn(1000, callback=watch)
+    # The wrapper had taken it in; its statistics are those of the last rollout again, and training goes on
+    for moments in (env.obs_rms, env.ret_rms):
+        assert np.isfinite(moments.mean).all() and np.isfinite(moments.var).all()
+    assert not told or min(np.abs(each - env.obs_rms.mean).max() for each in told) == 0
+    model.learn(60, reset_num_timesteps=False)
 
 
 def test_infinite_values_stop_it_too():

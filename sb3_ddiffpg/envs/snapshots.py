@@ -189,5 +189,31 @@ def restore_normalization(env: VecNormalize, tree: Any) -> None:
         target.mean, target.var, target.count = saved.mean.copy(), saved.var.copy(), saved.count
 
 
+class NormalizationBackup:
+    """Running statistics as they were before an environment told NaN, which VecNormalize takes in before anyone can see it."""
+
+    def __init__(self) -> None:
+        self._state: dict[str, Any] | None = None
+
+    def note(self, env: VecNormalize) -> None:
+        """
+        :param env: Whose statistics are kept if they are finite
+        """
+        if self._finite(state := normalization(env)):
+            self._state = state
+
+    def mend(self, env: VecNormalize) -> None:
+        """
+        :param env: Gets back what was kept if its statistics are not finite
+        """
+        if self._state is not None and not self._finite(normalization(env)):
+            restore_normalization(env, self._state)
+
+    @staticmethod
+    def _finite(state: dict[str, Any]) -> bool:
+        moments = [*state["observations"].values(), state["returns"]]
+        return all(np.isfinite(each[name]).all() for each in moments for name in ("mean", "var", "count"))
+
+
 def _moments(moments: RunningMeanStd) -> dict[str, Any]:
     return {"mean": np.asarray(moments.mean), "var": np.asarray(moments.var), "count": float(moments.count)}
