@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-#: Equal parts of a way, and in how many of them an episode must have been to have come along it
-N_PARTS, PARTS_GONE = 10, 8
+#: Equal parts of a way, and the share of them in which an episode must have been to have come along it
+N_PARTS, SHARE_GONE = 10, 0.8
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class KnownWays:
 
     def replace(self, ways: Sequence[Way]) -> None:
         """
-        :param ways: The ways that are known from now on; ``recall`` says where the running episodes have been
+        :param ways: The ways that are known from now on. Where the running episodes have been must be told again
         """
         self.ways = list(ways)
         # Counted from a corner at 1: where numbers next to 0 are rounded to 0 (``set_flush_denormal``), a tree whose points
@@ -54,6 +54,7 @@ class KnownWays:
         self._corners = [way.points.min(axis=0) - 1.0 for way in ways]
         self._trees = [cKDTree(way.points - corner) for way, corner in zip(ways, self._corners, strict=True)]
         self._been = np.zeros((len(ways), self.n_envs), dtype=np.int64)
+        self.followed = np.zeros(self.n_envs, dtype=bool)
 
     def observe(self, envs: np.ndarray, positions: np.ndarray) -> None:
         """
@@ -61,11 +62,12 @@ class KnownWays:
         :param positions: Where to, shape [N, dim]
         """
         for been, tree, corner, way in zip(self._been, self._trees, self._corners, self.ways, strict=True):
+            n_points = way.paths.shape[1]
+            n_parts = min(N_PARTS, n_points)
             distances, nearest = tree.query(positions - corner, distance_upper_bound=way.radius)
             near = np.isfinite(distances)
-            n_points = way.paths.shape[1]
-            np.bitwise_or.at(been, envs[near], 1 << (nearest[near] % n_points * N_PARTS // n_points))
-        self.followed |= (np.bitwise_count(self._been) >= PARTS_GONE).any(axis=0)
+            np.bitwise_or.at(been, envs[near], 1 << (nearest[near] % n_points * n_parts // n_points))
+            self.followed |= np.bitwise_count(been) >= SHARE_GONE * n_parts
 
     def forget(self, env: int) -> None:
         """
