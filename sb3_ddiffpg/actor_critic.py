@@ -21,7 +21,7 @@ from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.cuda_graphs import GraphedFunction
 from sb3_ddiffpg.divergence import EXPLODED, DivergenceWatch
-from sb3_ddiffpg.envs.snapshots import NormalizationBackup
+from sb3_ddiffpg.envs.snapshots import normalization, restore_normalization
 from sb3_ddiffpg.features import declared_cell_size, declared_mode_features, describe_env
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, VisitCounts, noveld_reward
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
@@ -282,7 +282,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         self.graphs = {"critics": GraphedFunction(self._critic_gradients, self.policy, self.policy.critics.optimizer)}
         span = (self.critics.upper - self.critics.lower).max().item()
         self.divergence_watch = DivergenceWatch(self.device, EXPLODED * max(1.0, span**2))
-        self._normalization_backup = NormalizationBackup()
+        self._sound_normalization: dict[str, Any] | None = None
 
     @property
     def critics(self) -> ModeCritics:
@@ -491,7 +491,8 @@ class NoveltyActorCritic(SavableAlgorithm):
 
     def _store_transition(self, replay_buffer: ModeReplayBuffer, *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
         super()._store_transition(replay_buffer, *args, **kwargs)
-        self.novelty_model.observe(th.as_tensor(replay_buffer.counted_positions(), device=self.device))
+        if len(counted := replay_buffer.counted_positions()):
+            self.novelty_model.observe(th.as_tensor(counted, device=self.device))
         if self.visits is not None:
             self.visits.observe(replay_buffer.last_positions())
         for _, trajectory in replay_buffer.just_finished:
@@ -609,25 +610,28 @@ class NoveltyActorCritic(SavableAlgorithm):
         or an interrupt: the next ``learn`` then resets the environments, or the running trajectories would have a gap.
         """
         complete = False
-        self._note_normalization()
         try:
             rollout = super().collect_rollouts(*args, **kwargs)
             complete = rollout.continue_training
+        except ValueError:
+            # VecNormalize has taken in what was refused
+            if self._vec_normalize_env is not None and self._sound_normalization is not None:
+                restore_normalization(self._vec_normalize_env, self._sound_normalization)
+            raise
         finally:
             if not complete:
                 self._last_obs = None
-                if self._vec_normalize_env is not None:
-                    self._normalization_backup.mend(self._vec_normalize_env)
+        self._note_normalization()
         return rollout
 
     def _note_normalization(self) -> None:
         if self._vec_normalize_env is not None:
-            self._normalization_backup.note(self._vec_normalize_env)
+            self._sound_normalization = normalization(self._vec_normalize_env)
 
     # ------------------------------------------------------------------ saving
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "graphs", "divergence_watch", "_normalization_backup"]
+        return [*super()._excluded_save_params(), "actor", "graphs", "divergence_watch", "_sound_normalization"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names = ["policy", "actor.optimizer", "policy.critics.optimizer", "novelty_model", "intrinsic_moments"]

@@ -35,6 +35,7 @@ class _Group(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _Way(msgspec.Struct, forbid_unknown_fields=True):
+    number: int
     paths: np.ndarray
     radius: float
 
@@ -61,12 +62,12 @@ class _Buffer(msgspec.Struct, forbid_unknown_fields=True):
     n_path_points: int
     feature_scale: np.ndarray | None
     last_positions: np.ndarray
-    known_ways: list[_Way]
     serials: np.ndarray
     distances: np.ndarray
     compared_length: float | None = None
     loop_share: float | None = None
     normalize_distances: bool | None = None
+    known_ways: list[_Way] = []
 
 
 # Settings on which they depend, beside ``n_path_points``
@@ -127,7 +128,7 @@ def buffer_state(buffer: ModeReplayBuffer) -> dict[str, Any] | None:
         "n_path_points": buffer.n_path_points,
         "feature_scale": buffer._feature_scale,
         "last_positions": buffer._last_positions,
-        "known_ways": [{"paths": way.paths, "radius": way.radius} for way in buffer.known_ways.ways],
+        "known_ways": [{"number": way.number, "paths": way.paths, "radius": way.radius} for way in buffer.known_ways.ways],
         "serials": buffer._distances.serials,
         "distances": buffer._distances.distances,
         **{name: getattr(buffer, name) for name in _OF_DISTANCES},
@@ -177,7 +178,7 @@ def restore_buffer(buffer: ModeReplayBuffer, tree: Any) -> None:
     buffer._feature_scale, buffer._last_positions = state.feature_scale, state.last_positions
     if all(getattr(state, name) == getattr(buffer, name) for name in _OF_DISTANCES):  # else they are of other paths
         buffer._distances.serials, buffer._distances.distances = state.serials, state.distances
-    buffer.known_ways.replace([Way(way.paths, way.radius) for way in state.known_ways])
+    buffer.known_ways.replace([Way(way.number, way.paths, way.radius) for way in state.known_ways])
     buffer.recall_places()
 
 
@@ -233,6 +234,7 @@ def _check(buffer: ModeReplayBuffer, state: _Buffer, trajectories: list[Trajecto
         "a trajectory that trains no mode": any(each.trains and each.mode == NO_MODE for each in trajectories),
         "two groups of the same": len({(group.mode, group.success) for group in state.groups}) < len(state.groups),
         "a group with another mode's member": any(trajectories[i].mode != g.mode for g in state.groups for i in g.members),
+        "a known way that cannot be": not all(_can_be(way) for way in state.known_ways),
         "new ways that are not stored": not np.isin(state.new_way_rows, state.stored).all(),
         "frozen modes that are not there": not set(state.frozen_modes) <= set(range(n_modes)),
         "a trajectory from the future": any(each.serial >= state.n_finished for each in trajectories),
@@ -241,6 +243,10 @@ def _check(buffer: ModeReplayBuffer, state: _Buffer, trajectories: list[Trajecto
     for problem, found in problems.items():
         if found:
             raise ValueError(f"replay buffer: there is {problem}")
+
+
+def _can_be(way: _Way) -> bool:
+    return bool(0 <= way.number < 2**31 and len(way.paths) and np.isfinite(way.paths).all() and 0 <= way.radius < np.inf)
 
 
 def _check_arrays(buffer: ModeReplayBuffer, state: _Buffer) -> None:

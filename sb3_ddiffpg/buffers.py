@@ -1,6 +1,6 @@
 """Replay buffer that knows modes, and stores target actions beside every action."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
 from sb3_ddiffpg.dtw import LOOP_SHARE, N_PATH_POINTS, comparable_path
 from sb3_ddiffpg.features import ModeFeatures
 from sb3_ddiffpg.intrinsic import cell_entries
-from sb3_ddiffpg.known_ways import KnownWays, Way
+from sb3_ddiffpg.known_ways import NO_WAY, KnownWays, Way
 from sb3_ddiffpg.row_storage import Fields
 from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, Trajectory
 from sb3_ddiffpg.trajectory_buffer import TrajectoryReplayBuffer
@@ -101,7 +101,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     :raises ValueError: If a size is not positive and finite or ``optimize_memory_usage`` is asked for
     """
 
-    compared_length: float | None = None  # a buffer that was pickled before there was such a thing has none
     target_actions: Any
     exploratory_target_actions: Any
     foreign: np.ndarray
@@ -186,8 +185,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.mode_rows: list[RowSet] = []
         self._new_way_rows = np.empty(0, dtype=np.int32)
         self._episode_places: list[set[int]] = [set() for _ in range(self.n_envs)]
-        self.known_ways = KnownWays(self.n_envs)
-        self._last_followed = self.known_ways.followed.copy()
+        self._forget_ways()
 
     def _step_fields(self) -> Fields:
         action = ((self.action_dim,), np.float32)
@@ -195,7 +193,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
 
     def _note_fields(self) -> Fields:
         own: Fields = {"foreign": ((), bool), "off_route": ((), bool), "way_novelty": ((), np.float32), "goals": ((), bool)}
-        own["first_visits"] = own["followed"] = (), bool
+        own["first_visits"], own["followed"] = ((), bool), ((), np.int32)
         return {**super()._note_fields(), **own}
 
     def _view_names(self) -> list[str]:
@@ -293,7 +291,18 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         """
         :return: Those of ``last_positions`` whose visits count: not of an episode that came along a known way
         """
-        return self._last_positions[~self._last_followed]
+        return self._last_positions[self._last_followed == NO_WAY]
+
+    def past_known_ways(self, rows: np.ndarray) -> np.ndarray:
+        """
+        :param rows: Any shape
+        :return: Which of them are of an episode that had come along a way that is known still, same shape
+        """
+        return np.isin(self.followed[rows], self.known_ways.numbers())
+
+    def _forget_ways(self) -> None:
+        self.known_ways = KnownWays(self.n_envs)
+        self._last_followed = self.known_ways.followed.copy()
 
     def expect_modes(self, n_modes: int) -> None:
         """
@@ -302,6 +311,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param n_modes: Number of modes of the model
         """
         successes, failures = self.trajectories(success=True), self.trajectories(success=False)
+        self._forget_ways()
         nobody = np.full(len(successes), NO_MODE), np.full(len(failures), NO_MODE)
         self.assign_modes(successes, nobody[0], failures, nobody[1], [None] * n_modes)
 
@@ -312,6 +322,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param new_modes: New index of every mode so far, ``NO_MODE`` if the model does not have it
         :param numbers: Numbers of the model's modes
         """
+        self.known_ways.replace([way for way in self.known_ways.ways if way.number in numbers])
+        self._recall_ways()
         stored = self.trajectories(success=True) + self.trajectories(success=False)
         for trajectory in stored:
             if trajectory.foreign and trajectory.commanded not in numbers:
@@ -355,6 +367,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
 
     def _forget_paths(self) -> None:
         """What is compared has changed."""
+        self._forget_ways()
         self._distances = DistanceCache(self.normalize_distances)
         for success in (True, False):
             for trajectory in self.trajectories(success):
@@ -451,7 +464,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             self._retired.append(trajectory)
         new_ways = [trajectory.rows for trajectory in stays if self.way_novelty[trajectory.rows[-1]] > 0]
         for rows in new_ways:  # along a known way for long, but on to a new one
-            self.followed[rows] = False
+            self.followed[rows] = NO_WAY
         self._new_way_rows = np.concatenate([self._new_way_rows[:0], *new_ways])
 
     def places_of(self, modes: Collection[int]) -> th.Tensor:
@@ -464,15 +477,19 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             return th.empty(0, self.features.dim)
         return self.features.of_tensors(self.read_observations(np.concatenate(rows))[1])
 
-    def watch_ways(self, modes: Collection[int]) -> None:
+    def watch_ways(self, modes: Mapping[int, int]) -> None:
         """
         Note from now on which steps are of episodes that have come along the way of one of these modes: ``followed``.
 
-        :param modes: Indices of modes
+        :param modes: Numbers of modes by their indices
         """
-        members = [[each for each in self.trajectories(success=True) if each.trains and each.mode == mode] for mode in modes]
-        paths = [np.stack([self.path(each) for each in those]) for those in members if those]
-        self.known_ways.replace([Way(each, self.route_share * _extent(each)) for each in paths])
+        ways = []
+        for mode, number in modes.items():
+            members = [each for each in self.trajectories(success=True) if each.trains and each.mode == mode]
+            if members:
+                paths = np.stack([self.path(each) for each in members])
+                ways.append(Way(number, paths, self.route_share * _extent(paths)))
+        self.known_ways.replace(ways)
         self._recall_ways()
 
     def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:
@@ -582,8 +599,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             # for ends it, or it would be paid again and again
             unpaid = notes["goals"] & ~((notes["way_novelty"] > 0) & (self.new_way_share > 0))
             ended[EXPLORATORY_GROUP] &= ~np.take_along_axis(unpaid, ends, axis=-1)[EXPLORATORY_GROUP, :, 0]
+        past = np.isin(notes["followed"], self.known_ways.numbers())[EXPLORATORY_GROUP] & present[EXPLORATORY_GROUP]
         # Nor is what lies past a known way worth anything to explorers who came along it
-        ended[EXPLORATORY_GROUP] |= (notes["followed"] & present)[EXPLORATORY_GROUP].any(axis=-1)
+        ended[EXPLORATORY_GROUP] |= past.any(axis=-1)
         discounts = gammas**lengths * ~(ended | lost.any(axis=-1))
         steps = self._on_device(self._steps.tensors(rows.ravel()))
         nexts = self._on_device(self._nexts.tensors(last))

@@ -413,7 +413,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         if not self._modes:
             return pays
         explores = np.nonzero(present)[0] == EXPLORATORY_GROUP
-        past = th.from_numpy(explores & self.replay_buffer.followed[windows[present]])
+        past = th.from_numpy(explores & self.replay_buffer.past_known_ways(windows[present]))
         pays = pays & ~past.to(self.device, non_blocking=True)
         if self.explore_off_modes:
             # What a mode knows is not new, or explorers would follow it to what lies beyond
@@ -432,8 +432,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         able = [index for index, mode in enumerate(self._modes) if mode.success_rate >= ABLE]
         if self.explore_off_modes:
             self.known_places.replace(self.replay_buffer.places_of(able))
-        if not self.explore_past_modes:
-            self.replay_buffer.watch_ways(able)
+        watched = [] if self.explore_past_modes else able
+        self.replay_buffer.watch_ways({index: self._modes[index].number for index in watched})
         return events
 
     def _row_embeddings(self, batch: ModeBatch, masked: bool) -> th.Tensor:

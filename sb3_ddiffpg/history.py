@@ -77,6 +77,11 @@ class ModeHistory:
         self._columns: list[array[Any]] = [array("q"), array("q"), array("q"), array("d")]
         self._append(states)
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        if "states" in state:  # pickled when it was a list
+            state = vars(ModeHistory(state["events"], state["states"]))
+        self.__dict__.update(state)
+
     @property
     def states(self) -> list[ModeState]:
         """In order of time; made anew when asked for."""

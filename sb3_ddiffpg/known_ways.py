@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+NO_WAY = -1
 #: Equal parts of a way, and the share of them in which an episode must have been to have come along it
 N_PARTS, SHARE_GONE = 10, 0.8
 
@@ -15,10 +16,12 @@ class Way:
     """
     Where the trajectories of a mode go.
 
+    :param number: The mode's number, which nothing changes
     :param paths: Resampled to equal distances, shape [K, n_points, dim]
     :param radius: How far from them is on the way still, in their unit
     """
 
+    number: int
     paths: np.ndarray
     radius: float
 
@@ -41,20 +44,26 @@ class KnownWays:
         self._trees: list[cKDTree] = []
         self._corners: list[np.ndarray] = []
         self._been = np.zeros((0, n_envs), dtype=np.int64)  # a bit for each part of a way
-        #: Which running episodes have come along one of the ways, shape [n_envs]
-        self.followed = np.zeros(n_envs, dtype=bool)
+        #: Number of the way that a running episode has come along, ``NO_WAY`` for none, shape [n_envs]
+        self.followed = np.full(n_envs, NO_WAY, dtype=np.int32)
+
+    def numbers(self) -> list[int]:
+        """
+        :return: Of the ways that are known
+        """
+        return [way.number for way in self.ways]
 
     def replace(self, ways: Sequence[Way]) -> None:
         """
         :param ways: The ways that are known from now on. Where the running episodes have been must be told again
         """
-        self.ways = list(ways)
         # Counted from a corner at 1: where numbers next to 0 are rounded to 0 (``set_flush_denormal``), a tree whose points
         # have zeros splits for ever and takes the process with it
         self._corners = [way.points.min(axis=0) - 1.0 for way in ways]
         self._trees = [cKDTree(way.points - corner) for way, corner in zip(ways, self._corners, strict=True)]
+        self.ways = list(ways)
         self._been = np.zeros((len(ways), self.n_envs), dtype=np.int64)
-        self.followed = np.zeros(self.n_envs, dtype=bool)
+        self.followed = np.full(self.n_envs, NO_WAY, dtype=np.int32)
 
     def observe(self, envs: np.ndarray, positions: np.ndarray) -> None:
         """
@@ -67,11 +76,12 @@ class KnownWays:
             distances, nearest = tree.query(positions - corner, distance_upper_bound=way.radius)
             near = np.isfinite(distances)
             np.bitwise_or.at(been, envs[near], 1 << (nearest[near] % n_points * n_parts // n_points))
-            self.followed |= np.bitwise_count(been) >= SHARE_GONE * n_parts
+            came = (self.followed == NO_WAY) & (np.bitwise_count(been) >= SHARE_GONE * n_parts)
+            self.followed[came] = way.number
 
     def forget(self, env: int) -> None:
         """
         :param env: Environment whose episode has ended
         """
         self._been[:, env] = 0
-        self.followed[env] = False
+        self.followed[env] = NO_WAY

@@ -210,7 +210,10 @@ class TrajectoryReplayBuffer(ReplayBuffer):
     def _restore(self, saved_rows: list[np.ndarray], saved_positions: list[np.ndarray]) -> None:
         all_rows = self._all
         self._allocate()
-        for part, records in zip(self._stored(), saved_rows, strict=True):
+        for part, fields, records in zip(self._stored(), self.part_fields(), saved_rows, strict=True):
+            size = HostRows(0, fields).dtype.itemsize
+            if records.shape[1] != size:
+                raise ValueError(f"The replay buffer is of another version: rows of {records.shape[1]} bytes, here of {size}")
             part.restore(records)
         for array, used in zip(self._position_arrays(), saved_positions, strict=True):
             array[: self.pos] = used

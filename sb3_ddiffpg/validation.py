@@ -71,6 +71,11 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     (("learning_rate",), "be a number of at least 0 or a schedule", _is_rate),
     (("qf_learning_rate",), "be a number of at least 0, a schedule or None", lambda value: value is None or _is_rate(value)),
     (
+        ("latent_coef",),
+        "be a finite number of at least 0 or a schedule",
+        lambda value: callable(value) or (_is_number(value) and 0 <= value < np.inf),
+    ),
+    (
         ("exploration_share",),
         "lie in [0, 1], be a schedule or None",
         lambda value: value is None or callable(value) or _is_share(value),

@@ -81,11 +81,11 @@ class AnySpaces(gym.Env):
 
 
 class BreaksAt(gym.Wrapper):
-    """Gives NaN for the ``part`` of the ``when``-th step (or reset), counted over episodes from 1, and only then."""
+    """Gives ``value`` for the ``part`` of the ``when``-th step (or reset), counted over episodes from 1, and only then."""
 
-    def __init__(self, env: gym.Env, part: str, when: int) -> None:
+    def __init__(self, env: gym.Env, part: str, when: int, value: float = np.nan) -> None:
         super().__init__(env)
-        self.part, self.when, self.count = part, when, 0
+        self.part, self.when, self.value, self.count = part, when, value, 0
 
     def _breaks(self, here: bool) -> bool:
         self.count += here
@@ -93,14 +93,20 @@ class BreaksAt(gym.Wrapper):
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict]:
         observation, info = self.env.reset(**kwargs)
-        return (observation * np.nan if self._breaks(self.part == "reset") else observation), info
+        return (self._broken(observation) if self._breaks(self.part == "reset") else observation), info
 
     def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict]:
         assert np.isfinite(action).all(), "a simulator must not be given NaN"
         observation, reward, terminated, truncated, info = self.env.step(action)
         if self._breaks(self.part != "reset"):
-            observation, reward = (observation * np.nan, reward) if self.part == "observation" else (observation, np.nan)
+            if self.part == "observation":
+                observation = self._broken(observation)
+            else:
+                reward = self.value
         return observation, reward, terminated, truncated, info
+
+    def _broken(self, observation: np.ndarray) -> np.ndarray:
+        return np.full_like(observation, self.value)
 
 
 # Random rewards are no reason to warn of returns outside the critics' support

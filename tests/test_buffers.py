@@ -411,15 +411,13 @@ def test_another_compared_length_makes_known_distances_anew():
         np.testing.assert_array_equal(restored.success_distances(restored.trajectories(True)), expected)
 
 
-def test_a_buffer_from_before_there_was_a_compared_length():
-    model = small_model(DummyVecEnv([TwoEnds] * 2))
-    model.learn(200)
-    del model.replay_buffer.__dict__["compared_length"]
-    stream = io.BytesIO()
-    model.save_replay_buffer(stream)
-    stream.seek(0)
-    model.load_replay_buffer(stream)
-    assert model.replay_buffer.compared_length is None
+def test_a_buffer_with_other_rows_is_refused():
+    buffer = make_buffer(20)
+    fill(buffer, [np.zeros((5, 2), dtype=np.float32)])
+    state = buffer.__getstate__()
+    state["saved_rows"] = [records[:, :-4] for records in state["saved_rows"]]
+    with pytest.raises(ValueError, match="of another version: rows of"):
+        make_buffer(20).__setstate__(state)
 
 
 def test_a_rare_mode_is_never_crowded_out():

@@ -107,6 +107,15 @@ def test_exactly(tmp_path, seed):
     assert len(whole.modes) == 2 and min(born) > END // 8  # so that some checkpoints lie before, some after
 
 
+def test_past_known_ways(tmp_path, monkeypatch):
+    """Where an episode has come along a way after its first steps, some have at most checkpoints."""
+    monkeypatch.setattr("sb3_ddiffpg.known_ways.SHARE_GONE", 0.2)
+    whole = assert_goes_on_the_same(known_ends, tmp_path)
+    assert (whole.replay_buffer.followed[whole.replay_buffer._all.rows[: whole.replay_buffer.size()]] >= 0).any()
+    resumed = [DDiffPG.resume(path, known_ends()).replay_buffer.known_ways for path in checkpoint_files(tmp_path)]
+    assert sum((known.followed >= 0).any() for known in resumed) >= 2
+
+
 def test_with_a_full_buffer_and_wrappers(tmp_path):
     def make_env():
         env = DummyVecEnv([lambda: Monitor(KnownEnds())] * 2)

@@ -5,6 +5,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from environments import fill
 from gymnasium import spaces
 from hypothesis import given, settings
@@ -16,13 +17,25 @@ from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
 from sb3_ddiffpg.buffer_state import buffer_state, restore_buffer
 from sb3_ddiffpg.buffers import ModeReplayBuffer
-from sb3_ddiffpg.known_ways import KnownWays, Way
+from sb3_ddiffpg.dtw import N_PATH_POINTS
+from sb3_ddiffpg.known_ways import NO_WAY, KnownWays, Way
+from sb3_ddiffpg.zoo import config_file
 
 LINE, ACTION = spaces.Box(-np.inf, np.inf, (1,)), spaces.Box(-1.0, 1.0, (1,))
 
 
 def slow_followed(ways, positions):
-    """Whether an episode that was at these positions came through eight tenths of one of the ways."""
+    """
+    Number of the way of which an episode that was at these positions came through eight tenths, position by position; the
+    first if several at the same time.
+    """
+    for n in range(1, len(positions) + 1):
+        if (number := followed_now(ways, positions[:n])) >= 0:
+            return number
+    return -1
+
+
+def followed_now(ways, positions):
     for way in ways:
         parts = set()
         for position in positions:
@@ -33,8 +46,8 @@ def slow_followed(ways, positions):
                 n_parts = min(10, way.paths.shape[1])
                 parts.add(nearest[1] * n_parts // way.paths.shape[1])
         if parts and len(parts) / n_parts >= 0.8:
-            return True
-    return False
+            return way.number
+    return -1
 
 
 @settings(deadline=None)
@@ -42,14 +55,14 @@ def slow_followed(ways, positions):
 def test_followed_as_told_one_by_one(seed, n_ways, dim, n_points):
     rng = np.random.default_rng(seed)
     n_envs = 3
-    ways = [Way(rng.normal(size=(2, n_points, dim)).cumsum(axis=1), rng.uniform(0.5, 2.0)) for _ in range(n_ways)]
+    ways = [Way(7 + i, rng.normal(size=(2, n_points, dim)).cumsum(axis=1), rng.uniform(0.5, 2.0)) for i in range(n_ways)]
     known = KnownWays(n_envs)
     known.replace(ways)
     been = [[] for _ in range(n_envs)]
     for _ in range(25):
-        envs = rng.integers(n_envs, size=4)
+        envs = rng.permutation(n_envs)
         way = ways[rng.integers(n_ways)].paths[0]
-        positions = way[rng.integers(n_points, size=4)] + rng.normal(scale=0.3, size=(4, dim))
+        positions = way[rng.integers(n_points, size=n_envs)] + rng.normal(scale=0.3, size=(n_envs, dim))
         known.observe(envs, positions)
         for env, position in zip(envs, positions, strict=True):
             been[env].append(position)
@@ -67,9 +80,9 @@ def test_a_way_with_zeros_where_denormal_numbers_are_flushed():
     try:
         path = np.append(np.zeros(12), np.linspace(0, 40, 88)).reshape(1, -1, 1).astype(np.float32)
         known = KnownWays(1)
-        known.replace([Way(np.repeat(path, 20, axis=0), 1.0)])
+        known.replace([Way(0, np.repeat(path, 20, axis=0), 1.0)])
         known.observe(np.zeros(40, dtype=int), np.arange(40.0)[:, None])
-        assert known.followed.all()
+        assert known.followed.tolist() == [0]
     finally:
         th.set_flush_denormal(False)
 
@@ -94,7 +107,7 @@ def add(buffer, now, then, done, success=True):
 
 def test_an_episode_that_came_along_the_way_is_told_from_one_that_did_not():
     buffer = line_buffer(n_envs=2)
-    buffer.watch_ways([0])
+    buffer.watch_ways({0: 5})
     counted = []
     for step in range(14):  # one goes on past the end, one turns round after two
         along, away = step + 0.5, min(step + 0.5, 3.5 - step)
@@ -102,8 +115,9 @@ def test_an_episode_that_came_along_the_way_is_told_from_one_that_did_not():
         counted.append(buffer.counted_positions()[:, 0].tolist())
     along, away = buffer.trajectories(False)
     # In the eighth tenth of the way when it comes to 7.5
-    np.testing.assert_array_equal(buffer.followed[along.rows], np.arange(14) >= 7)
-    assert not buffer.followed[away.rows].any()
+    np.testing.assert_array_equal(buffer.followed[along.rows], np.where(np.arange(14) >= 7, 5, NO_WAY))
+    np.testing.assert_array_equal(buffer.past_known_ways(along.rows), np.arange(14) >= 7)
+    assert (buffer.followed[away.rows] == NO_WAY).all()
     assert [len(each) for each in counted] == [2] * 7 + [1] * 7 and counted[-1] == [-9.5]
     add(buffer, [0, 0], [1, 1], False)
     assert len(buffer.counted_positions()) == 2  # the next episode starts anew
@@ -111,7 +125,7 @@ def test_an_episode_that_came_along_the_way_is_told_from_one_that_did_not():
 
 def test_what_lies_past_the_way_is_worth_nothing_to_explorers_alone():
     buffer = line_buffer()
-    buffer.watch_ways([0])
+    buffer.watch_ways({0: 5})
     for step in range(14):
         add(buffer, [step - 0.5], [step + 0.5], step == 13, success=False)
     rows = buffer.trajectories(False)[0].rows
@@ -125,35 +139,89 @@ def test_what_lies_past_the_way_is_worth_nothing_to_explorers_alone():
 
 def test_a_new_way_that_leads_on_from_a_known_one_keeps_its_worth():
     buffer = line_buffer()
-    buffer.watch_ways([0])
+    buffer.watch_ways({0: 5})
     for step in range(14):
         add(buffer, [step - 0.5], [step + 0.5], step == 13)
     newest = max(buffer.trajectories(True), key=lambda each: each.serial)
-    assert buffer.followed[newest.rows].any()
+    assert buffer.past_known_ways(newest.rows).any()
     successes = buffer.trajectories(True)
     labels = np.array([-1 if each is newest else 0 for each in successes])
     buffer.assign_modes(successes, labels, [], np.zeros(0, dtype=int), [0])
-    assert not buffer.followed[newest.rows].any()
+    assert (buffer.followed[newest.rows] == NO_WAY).all()
 
 
 def test_known_ways_go_on_where_they_were():
     buffer = line_buffer()
-    buffer.watch_ways([0])
+    buffer.watch_ways({0: 5})
     for step in range(7):
         add(buffer, [step - 0.5], [step + 0.5], False)
     again = ModeReplayBuffer(500, LINE, ACTION, device="cpu", visit_cell_size=1.0)
     again.mode_rows = list(buffer.mode_rows)
     restore_buffer(again, buffer_state(buffer))
     for each in (buffer, again):
-        assert not each.known_ways.followed.any()
+        assert each.known_ways.followed.tolist() == [NO_WAY]
         add(each, [6.5], [7.5], False)
-        assert each.known_ways.followed.all() and len(each.counted_positions()) == 0
-        each.watch_ways([])
-        assert not each.known_ways.followed.any()
-        each.watch_ways([0])
-        assert each.known_ways.followed.all()
+        assert each.known_ways.followed.tolist() == [5] and len(each.counted_positions()) == 0
+        each.watch_ways({})
+        assert each.known_ways.followed.tolist() == [NO_WAY] and not each.past_known_ways(each._all.rows[: each.size()]).any()
+        each.watch_ways({0: 5})
+        assert each.known_ways.followed.tolist() == [5]
         each.drop_unfinished_episodes()
-        assert not each.known_ways.followed.any()
+        assert each.known_ways.followed.tolist() == [NO_WAY]
+
+
+@pytest.mark.parametrize(
+    ("part", "wrong"),
+    [
+        ("paths", np.empty((0, N_PATH_POINTS, 1), np.float32)),
+        ("paths", np.full((1, N_PATH_POINTS, 1), np.nan, np.float32)),
+        ("radius", np.nan),
+        ("radius", -1.0),
+        ("number", -1),
+        ("number", 2**40),
+    ],
+)
+def test_a_way_that_cannot_be_is_refused_before_anything_is_lost(part, wrong):
+    buffer = line_buffer()
+    buffer.watch_ways({0: 5})
+    state = buffer_state(buffer)
+    state["known_ways"][0][part] = wrong
+    size = buffer.size()
+    with pytest.raises(ValueError, match="a known way that cannot be"):
+        restore_buffer(buffer, state)
+    assert buffer.size() == size and buffer.known_ways.numbers() == [5]
+    add(buffer, [0], [1], False)
+
+
+def test_what_is_known_no_more_pays_again():
+    buffer = line_buffer()
+    buffer.watch_ways({0: 5})
+    for step in range(14):
+        add(buffer, [step - 0.5], [step + 0.5], step == 13, success=False)
+    rows = buffer.trajectories(False)[0].rows
+    for forget in (lambda: buffer.watch_ways({}), lambda: buffer.follow_modes([-1], []), lambda: buffer.expect_modes(1)):
+        buffer.watch_ways({0: 5})
+        assert buffer.past_known_ways(rows).sum() == 7
+        forget()
+        assert not buffer.past_known_ways(rows).any()
+        buffer.assign_modes(buffer.trajectories(True), np.zeros(4, dtype=int), [], np.zeros(0, dtype=int), [None])
+
+
+@pytest.mark.parametrize("novelty", ["rnd", "counts"])
+def test_when_all_environments_are_past_known_ways(novelty):
+    """There is nothing to observe: the mean of nothing is NaN."""
+    model = planar_model(novelty=novelty, novelty_kwargs={} if novelty == "rnd" else None)
+    walk(model, "up", 6)
+    model.recluster()
+    make_able(model, [0])
+    model.replay_buffer.known_ways.followed[:] = model.modes[0].number
+    before = {name: value.clone() for name, value in model.novelty_model.state_dict().items()}
+    model._last_obs = model.env.reset()
+    model._last_original_obs = model._last_obs
+    action = np.zeros((1, *model.action_space.shape), dtype=np.float32)
+    model._store_transition(model.replay_buffer, action, model._last_obs, np.zeros(1), np.zeros(1, dtype=bool), [{}])
+    for name, value in model.novelty_model.state_dict().items():
+        assert th.equal(value, before[name]), name
 
 
 @pytest.mark.parametrize(("explore_past_modes", "able"), [(False, [0]), (False, []), (True, [0])])
@@ -169,11 +237,26 @@ def test_explorers_past_an_able_mode_are_paid_nothing(explore_past_modes, able):
     past = buffer.trajectories(False)[-1].rows[:, None]
     rewards = model._intrinsic_rewards(np.stack([past, past]), defaultdict(list))
     stops = not explore_past_modes and bool(able)
-    assert bool((rewards[EXPLORATORY_GROUP, -12:] == 0).all()) is bool(buffer.followed[past].any()) is stops
+    assert bool((rewards[EXPLORATORY_GROUP, -12:] == 0).all()) is bool(buffer.past_known_ways(past).any()) is stops
     assert (rewards[EXPLORATORY_GROUP, :5] > 0).all() and (rewards[1, -12:] > 0).all()
 
 
-def test_the_paper_pays_past_modes(tmp_path):
-    model = planar_model(explore_past_modes=True)
+@pytest.mark.parametrize("explore_past_modes", [True, False])
+def test_the_setting_holds_for_what_is_loaded(tmp_path, explore_past_modes):
+    model = planar_model()
+    walk(model, "up", 6)
+    model.recluster()
+    make_able(model, [0])
+    assert model.replay_buffer.known_ways.ways
     model.save(tmp_path / "model")
-    assert DDiffPG.load(tmp_path / "model").explore_past_modes is True
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = DDiffPG.load(tmp_path / "model", explore_past_modes=explore_past_modes)
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    loaded.set_logger(model.logger)
+    loaded.recluster()
+    assert bool(loaded.replay_buffer.known_ways.ways) is not explore_past_modes
+
+
+def test_the_papers_settings_pay_past_modes():
+    entries = yaml.safe_load(config_file("ddiffpg").read_text())
+    assert entries["paper"]["explore_past_modes"] is True

@@ -1,5 +1,6 @@
 """What a user does with modes: rename, freeze, delete, filter, choose by value, and read what became of them."""
 
+import pickle
 import tracemalloc
 
 import numpy as np
@@ -13,7 +14,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import DDiffPG, Mode, reclustering
-from sb3_ddiffpg.history import ModeHistory
+from sb3_ddiffpg.history import ModeEvent, ModeHistory, ModeState
 from sb3_ddiffpg.modes import Outcome
 
 # ---------------------------------------------------------------------- names
@@ -259,6 +260,15 @@ def test_a_long_history_is_small():
         tracemalloc.stop()
     assert held / len(history.states) < 50 and len(history.states) == 10_000
     assert ModeHistory.from_state(history.state_dict()).states[-2:-1] == history.states[-2:-1] != []
+
+
+def test_a_history_that_was_pickled_as_lists():
+    event, state = ModeEvent(3, "born", 0, "mode_0"), ModeState(5, 0, 4, 0.5)
+    history = ModeHistory.__new__(ModeHistory)
+    history.__setstate__({"events": [event], "states": [state]})
+    assert history.events == [event] and history.states == [state]
+    again = pickle.loads(pickle.dumps(history))
+    assert again.events == [event] and again.states == [state]
 
 
 def test_a_history_of_impossible_numbers_is_refused():

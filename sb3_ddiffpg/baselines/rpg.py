@@ -297,7 +297,7 @@ class RPG(EntropyTuning):
     :param n_steps: Steps H of rollouts in the model, and of the segments from which it learns
     :param gae_lambda: Weight lambda of longer returns
     :param latent_dim: Size of the latent variable
-    :param latent_coef: Factor of log q(z | s, a) - log p(z) in the reward
+    :param latent_coef: Factor of log q(z | s, a) - log p(z) in the reward, a float or a function of the remaining progress
     :param reward_loss_coef: Factor of the reward's squared error in the model's loss
     :param value_loss_coef: Factor of the values' squared error
     :param state_loss_coef: Factor of the latent states' squared error
@@ -324,7 +324,7 @@ class RPG(EntropyTuning):
         n_steps: int = 3,
         gae_lambda: float = 0.97,
         latent_dim: int = 12,
-        latent_coef: float = 0.005,
+        latent_coef: float | Schedule = 0.005,
         reward_loss_coef: float = 10.0,
         value_loss_coef: float = 1.0,
         state_loss_coef: float = 100.0,
@@ -410,13 +410,15 @@ class RPG(EntropyTuning):
         :return: Lambda-returns [N] with the entropy and what is told about z, the actions' log probabilities [N * H], and
             log q(z | s, a) - log p(z) with a gradient for q alone [N * H]
         """
+        given = self.latent_coef
+        latent_coef = float(given(self._current_progress_remaining) if callable(given) else given)
         rewards, discounts, values, log_probabilities, ratios = [], [], [], [], []
         for _ in range(self.n_steps):
             actions, log_probability = self.actor.sample_from(th.cat((states, latents), dim=1))
             told = self.policy.inference.log_ratio(states, actions, latents)
             ratios.append(self.policy.inference.log_ratio(states.detach(), actions.detach(), latents))
             states, reward, end = model.step(states, actions)
-            rewards.append(reward - self.entropy_coef * log_probability + self.latent_coef * told)
+            rewards.append(reward - self.entropy_coef * log_probability + latent_coef * told)
             discounts.append(self.gamma * th.sigmoid(-end))
             values.append(model.values(states, latents).min(dim=0).values)
             log_probabilities.append(log_probability)

@@ -165,8 +165,8 @@ def normalization(env: VecNormalize) -> dict[str, Any]:
     :param env: Normalises observations, rewards or both
     :return: Its running statistics
     """
-    moments = env.obs_rms if isinstance(env.obs_rms, dict) else {"": env.obs_rms} if env.norm_obs else {}
-    return {"observations": {key: _moments(each) for key, each in moments.items()}, "returns": _moments(env.ret_rms)}
+    moments = {key: _moments(each) for key, each in _of_observations(env).items()}
+    return {"observations": moments, "returns": _moments(env.ret_rms)}
 
 
 def restore_normalization(env: VecNormalize, tree: Any) -> None:
@@ -176,7 +176,7 @@ def restore_normalization(env: VecNormalize, tree: Any) -> None:
     :raises ValueError: If it is of other observations
     """
     state = convert(tree, _Normalization, "normalization")
-    own: Any = env.obs_rms if isinstance(env.obs_rms, dict) else {"": env.obs_rms} if env.norm_obs else {}
+    own = _of_observations(env)
     if set(own) != set(state.observations):
         raise ValueError(f"normalization: of {sorted(state.observations)}, the environment's is of {sorted(own)}")
     pairs = [(own[key], each) for key, each in state.observations.items()] + [(env.ret_rms, state.returns)]
@@ -189,30 +189,10 @@ def restore_normalization(env: VecNormalize, tree: Any) -> None:
         target.mean, target.var, target.count = saved.mean.copy(), saved.var.copy(), saved.count
 
 
-class NormalizationBackup:
-    """Running statistics as they were before an environment told NaN, which VecNormalize takes in before anyone can see it."""
-
-    def __init__(self) -> None:
-        self._state: dict[str, Any] | None = None
-
-    def note(self, env: VecNormalize) -> None:
-        """
-        :param env: Whose statistics are kept if they are finite
-        """
-        if self._finite(state := normalization(env)):
-            self._state = state
-
-    def mend(self, env: VecNormalize) -> None:
-        """
-        :param env: Gets back what was kept if its statistics are not finite
-        """
-        if self._state is not None and not self._finite(normalization(env)):
-            restore_normalization(env, self._state)
-
-    @staticmethod
-    def _finite(state: dict[str, Any]) -> bool:
-        moments = [*state["observations"].values(), state["returns"]]
-        return all(np.isfinite(each[name]).all() for each in moments for name in ("mean", "var", "count"))
+def _of_observations(env: VecNormalize) -> dict[str, RunningMeanStd]:
+    if not env.norm_obs:
+        return {}  # SB3 makes none then
+    return env.obs_rms if isinstance(env.obs_rms, dict) else {"": env.obs_rms}
 
 
 def _moments(moments: RunningMeanStd) -> dict[str, Any]:
