@@ -123,7 +123,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param explore_off_modes: Whether explorers are paid nothing for places where the trajectories of the modes go that reach
         the goal in half of their episodes, so that another way pays where it leaves the known ones, not only where it ends
     :param explore_past_modes: Whether what lies past such a mode's way is worth anything to an explorer that came along it. If
-        not, its visits there do not count either: what is new by another way stays new
+        not, its visits there do not count either: what is new by another way stays new. That hinders ways that go on from the
+        end of a known one
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
     :param max_grad_norm: Largest gradient norm of the policy and of each mode's critics
@@ -213,7 +214,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         intrinsic_clip: float = 10.0,
         episodic_novelty: bool = True,
         explore_off_modes: bool = True,
-        explore_past_modes: bool = False,
+        explore_past_modes: bool = True,
         reset_new_critics: bool = True,
         max_grad_norm: float = 1.0,
         control: str | None = None,

@@ -210,7 +210,8 @@ def test_what_is_known_no_more_pays_again():
 @pytest.mark.parametrize("novelty", ["rnd", "counts"])
 def test_when_all_environments_are_past_known_ways(novelty):
     """There is nothing to observe: the mean of nothing is NaN."""
-    model = planar_model(novelty=novelty, novelty_kwargs={} if novelty == "rnd" else None)
+    kwargs = {"novelty_kwargs": {} if novelty == "rnd" else None, "explore_past_modes": False}
+    model = planar_model(novelty=novelty, **kwargs)
     walk(model, "up", 6)
     model.recluster()
     make_able(model, [0])
@@ -243,7 +244,7 @@ def test_explorers_past_an_able_mode_are_paid_nothing(explore_past_modes, able):
 
 @pytest.mark.parametrize("explore_past_modes", [True, False])
 def test_the_setting_holds_for_what_is_loaded(tmp_path, explore_past_modes):
-    model = planar_model()
+    model = planar_model(explore_past_modes=False)
     walk(model, "up", 6)
     model.recluster()
     make_able(model, [0])
