@@ -298,7 +298,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param rows: Any shape
         :return: Which of them are of an episode that had come along a way that is known still, same shape
         """
-        return np.isin(self.followed[rows], self.known_ways.numbers())
+        return self.known_ways.include(self.followed[rows])
 
     def _forget_ways(self) -> None:
         self.known_ways = KnownWays(self.n_envs)
@@ -599,7 +599,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             # for ends it, or it would be paid again and again
             unpaid = notes["goals"] & ~((notes["way_novelty"] > 0) & (self.new_way_share > 0))
             ended[EXPLORATORY_GROUP] &= ~np.take_along_axis(unpaid, ends, axis=-1)[EXPLORATORY_GROUP, :, 0]
-        past = np.isin(notes["followed"], self.known_ways.numbers())[EXPLORATORY_GROUP] & present[EXPLORATORY_GROUP]
+        past = self.known_ways.include(notes["followed"][EXPLORATORY_GROUP]) & present[EXPLORATORY_GROUP]
         # Nor is what lies past a known way worth anything to explorers who came along it
         ended[EXPLORATORY_GROUP] |= past.any(axis=-1)
         discounts = gammas**lengths * ~(ended | lost.any(axis=-1))

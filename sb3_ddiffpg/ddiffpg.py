@@ -414,8 +414,9 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         if not self._modes:
             return pays
         explores = np.nonzero(present)[0] == EXPLORATORY_GROUP
-        past = th.from_numpy(explores & self.replay_buffer.past_known_ways(windows[present]))
-        pays = pays & ~past.to(self.device, non_blocking=True)
+        if self.replay_buffer.known_ways.ways:
+            past = th.from_numpy(explores & self.replay_buffer.past_known_ways(windows[present]))
+            pays = pays & ~past.to(self.device, non_blocking=True)
         if self.explore_off_modes:
             # What a mode knows is not new, or explorers would follow it to what lies beyond
             there = th.from_numpy(explores).to(self.device, non_blocking=True)

@@ -53,6 +53,13 @@ class KnownWays:
         """
         return [way.number for way in self.ways]
 
+    def include(self, numbers: np.ndarray) -> np.ndarray:
+        """
+        :param numbers: Of ways, any shape
+        :return: Which of them are known, same shape
+        """
+        return np.isin(numbers, self.numbers())
+
     def replace(self, ways: Sequence[Way]) -> None:
         """
         :param ways: The ways that are known from now on. Where the running episodes have been must be told again
