@@ -14,7 +14,7 @@ from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
 from sb3_ddiffpg.dtw import LOOP_SHARE, N_PATH_POINTS, comparable_path
 from sb3_ddiffpg.features import ModeFeatures
 from sb3_ddiffpg.intrinsic import cell_entries
-from sb3_ddiffpg.known_ways import NO_WAY, KnownWays, Way
+from sb3_ddiffpg.known_ways import NO_WAY, KnownWays, Way, come_along
 from sb3_ddiffpg.row_storage import Fields
 from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, Trajectory
 from sb3_ddiffpg.trajectory_buffer import TrajectoryReplayBuffer
@@ -477,11 +477,13 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             return th.empty(0, self.features.dim)
         return self.features.of_tensors(self.read_observations(np.concatenate(rows))[1])
 
-    def watch_ways(self, modes: Mapping[int, int]) -> None:
+    def watch_ways(self, modes: Mapping[int, int]) -> np.ndarray:
         """
-        Note from now on which steps are of episodes that have come along the way of one of these modes: ``followed``.
+        Note from now on which steps are of episodes that have come along the way of one of these modes: ``followed``. The
+        episodes that are here already came along it unnoticed, and are noted too.
 
         :param modes: Numbers of modes by their indices
+        :return: Rows of the latter, of steps whose visits were counted
         """
         ways = []
         for mode, number in modes.items():
@@ -489,8 +491,26 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             if members:
                 paths = np.stack([self.path(each) for each in members])
                 ways.append(Way(number, paths, self.route_share * _extent(paths)))
+        unknown = [way for way in ways if way.number not in self.known_ways.numbers()]
         self.known_ways.replace(ways)
+        noted = self._note_past(unknown) if unknown else np.empty(0, dtype=np.int32)
         self._recall_ways()
+        return noted
+
+    def _note_past(self, ways: list[Way]) -> np.ndarray:
+        """``followed`` of the episodes that are here, running ones too; the rows of which it is changed from none."""
+        finished = [*self.trajectories(success=True), *self.trajectories(success=False), *self._retired]
+        # One that is a new way to a goal keeps its worth, however it began
+        episodes = [each.rows for each in finished if self.way_novelty[each.rows[-1]] == 0]
+        episodes += [self._running[env, :length] for env, length in enumerate(self._running_length) if length]
+        changed = []
+        for rows in episodes:
+            reached = self._positions(self._nexts, "next_observations", rows) / self._measured_scale()
+            followed = come_along(ways, reached)
+            came = (followed != NO_WAY) & ~self.past_known_ways(rows)
+            changed.append(rows[came & (self.followed[rows] == NO_WAY)])
+            self.followed[rows[came]] = followed[came]
+        return np.concatenate([np.empty(0, dtype=np.int32), *changed])
 
     def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:
         """

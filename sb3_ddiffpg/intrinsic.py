@@ -242,6 +242,16 @@ class VisitCounts(nn.Module):
         self.counts.index_add_(0, entries, th.ones_like(entries, dtype=self.counts.dtype))
 
     @th.no_grad()
+    def forget(self, positions: th.Tensor) -> None:
+        """
+        Take back visits that were counted.
+
+        :param positions: Shape [N, position_dim]
+        """
+        entries = self._entries(positions)
+        self.counts.index_add_(0, entries, -th.ones_like(entries, dtype=self.counts.dtype)).clamp_(min=0)
+
+    @th.no_grad()
     def novelty(self, positions: th.Tensor, observations: th.Tensor) -> th.Tensor:
         """
         :param positions: Shape [N, position_dim]
@@ -262,5 +272,6 @@ class VisitCounts(nn.Module):
 
 
 # A third measure is an nn.Module with the same methods, made with (position_dim, observation_dim, **novelty_kwargs) and passed
-# as ``novelty=``; ``optimizer`` is None if it does not learn, ``with_observation`` (False) asks for the observation features
+# as ``novelty=``; ``optimizer`` is None if it does not learn, ``with_observation`` (False) asks for the observation features;
+# ``forget`` is for those that can
 NOVELTY_MEASURES: dict[str, Any] = {"rnd": RandomNetworkDistillation, "counts": VisitCounts}

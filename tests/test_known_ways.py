@@ -18,21 +18,20 @@ from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
 from sb3_ddiffpg.buffer_state import buffer_state, restore_buffer
 from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.dtw import N_PATH_POINTS
-from sb3_ddiffpg.known_ways import NO_WAY, KnownWays, Way
+from sb3_ddiffpg.intrinsic import VisitCounts
+from sb3_ddiffpg.known_ways import NO_WAY, KnownWays, Way, come_along
 from sb3_ddiffpg.zoo import config_file
 
 LINE, ACTION = spaces.Box(-np.inf, np.inf, (1,)), spaces.Box(-1.0, 1.0, (1,))
 
 
-def slow_followed(ways, positions):
-    """
-    Number of the way of which an episode that was at these positions came through eight tenths, position by position; the
-    first if several at the same time.
-    """
+def slow_followed_at_each(ways, positions):
+    """Number of the way of which an episode came through eight tenths, position by position; the first if several at once."""
+    numbers = []
     for n in range(1, len(positions) + 1):
-        if (number := followed_now(ways, positions[:n])) >= 0:
-            return number
-    return -1
+        before = numbers[-1] if numbers else -1
+        numbers.append(before if before >= 0 else followed_now(ways, positions[:n]))
+    return numbers
 
 
 def followed_now(ways, positions):
@@ -58,7 +57,7 @@ def test_followed_as_told_one_by_one(seed, n_ways, dim, n_points):
     ways = [Way(7 + i, rng.normal(size=(2, n_points, dim)).cumsum(axis=1), rng.uniform(0.5, 2.0)) for i in range(n_ways)]
     known = KnownWays(n_envs)
     known.replace(ways)
-    been = [[] for _ in range(n_envs)]
+    been, told = [[] for _ in range(n_envs)], [-1] * n_envs
     for _ in range(25):
         envs = rng.permutation(n_envs)
         way = ways[rng.integers(n_ways)].paths[0]
@@ -66,11 +65,25 @@ def test_followed_as_told_one_by_one(seed, n_ways, dim, n_points):
         known.observe(envs, positions)
         for env, position in zip(envs, positions, strict=True):
             been[env].append(position)
+            told[env] = told[env] if told[env] >= 0 else followed_now(ways, been[env])
         if rng.random() < 0.1:
             env = int(rng.integers(n_envs))
             known.forget(env)
-            been[env] = []
-        np.testing.assert_array_equal(known.followed, [slow_followed(ways, each) for each in been])
+            been[env], told[env] = [], -1
+        np.testing.assert_array_equal(known.followed, told)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 3), st.integers(1, 2), st.sampled_from([2, 7, 20]))
+def test_a_whole_episode_as_told_one_by_one(seed, n_ways, dim, n_points):
+    rng = np.random.default_rng(seed)
+    ways = [Way(7 + i, rng.normal(size=(2, n_points, dim)).cumsum(axis=1), rng.uniform(0.5, 2.0)) for i in range(n_ways)]
+    positions = rng.normal(size=(12, dim))
+    if ways:  # along one of them for some time, or for all of it
+        along = np.concatenate([ways[rng.integers(n_ways)].paths[0], ways[0].paths[1]])
+        positions = along[np.sort(rng.integers(len(along), size=25))] + rng.normal(scale=0.2, size=(25, dim))
+    told = come_along(ways, positions)
+    np.testing.assert_array_equal(told, slow_followed_at_each(ways, positions))
 
 
 def test_a_way_with_zeros_where_denormal_numbers_are_flushed():
@@ -123,11 +136,44 @@ def test_an_episode_that_came_along_the_way_is_told_from_one_that_did_not():
     assert len(buffer.counted_positions()) == 2  # the next episode starts anew
 
 
+def go_on(buffer, success=False, steps=14):
+    """Each environment along the mode's way and past its end."""
+    for step in range(steps):
+        add(buffer, [step - 0.5] * buffer.n_envs, [step + 0.5] * buffer.n_envs, step == 13, success)
+
+
+@pytest.mark.parametrize("running", [False, True])
+def test_what_came_along_a_way_before_it_was_known(running):
+    """As if it had been known from the first."""
+    early, late = line_buffer(n_envs=2), line_buffer(n_envs=2)
+    assert len(early.watch_ways({0: 5})) == 0  # the few members pay as yet
+    for each in (early, late):
+        go_on(each, steps=12 if running else 14)
+    noted = late.watch_ways({0: 5})
+    rows = early._all.rows[: early.size()]
+    np.testing.assert_array_equal(early.followed[rows], late.followed[rows])
+    np.testing.assert_array_equal(np.sort(noted), np.sort(rows[late.followed[rows] == 5]))
+    assert early.known_ways.followed.tolist() == late.known_ways.followed.tolist() == ([5, 5] if running else [NO_WAY] * 2)
+    assert len(late.watch_ways({0: 5})) == 0  # not twice
+    late.watch_ways({})
+    assert len(late.watch_ways({0: 8})) == 0 and late.past_known_ways(noted).all()  # uncounted before: not once more
+
+
+def test_a_new_way_found_before_the_known_one_was_known_keeps_its_worth():
+    buffer = line_buffer()
+    go_on(buffer, success=True)
+    newest = max(buffer.trajectories(True), key=lambda each: each.serial)
+    successes = buffer.trajectories(True)
+    labels = np.array([-1 if each is newest else 0 for each in successes])
+    buffer.assign_modes(successes, labels, [], np.zeros(0, dtype=int), [0])
+    buffer.watch_ways({0: 5})
+    assert (buffer.followed[newest.rows] == NO_WAY).all()
+
+
 def test_what_lies_past_the_way_is_worth_nothing_to_explorers_alone():
     buffer = line_buffer()
     buffer.watch_ways({0: 5})
-    for step in range(14):
-        add(buffer, [step - 0.5], [step + 0.5], step == 13, success=False)
+    go_on(buffer)
     rows = buffer.trajectories(False)[0].rows
     batch = buffer.sample_modes(4000, 0.9, 3, 1)
     places = [{int(row): i for i, row in enumerate(group)} for group in batch.rows]
@@ -140,8 +186,7 @@ def test_what_lies_past_the_way_is_worth_nothing_to_explorers_alone():
 def test_a_new_way_that_leads_on_from_a_known_one_keeps_its_worth():
     buffer = line_buffer()
     buffer.watch_ways({0: 5})
-    for step in range(14):
-        add(buffer, [step - 0.5], [step + 0.5], step == 13)
+    go_on(buffer, success=True)
     newest = max(buffer.trajectories(True), key=lambda each: each.serial)
     assert buffer.past_known_ways(newest.rows).any()
     successes = buffer.trajectories(True)
@@ -153,8 +198,7 @@ def test_a_new_way_that_leads_on_from_a_known_one_keeps_its_worth():
 def test_known_ways_go_on_where_they_were():
     buffer = line_buffer()
     buffer.watch_ways({0: 5})
-    for step in range(7):
-        add(buffer, [step - 0.5], [step + 0.5], False)
+    go_on(buffer, steps=7)
     again = ModeReplayBuffer(500, LINE, ACTION, device="cpu", visit_cell_size=1.0)
     again.mode_rows = list(buffer.mode_rows)
     restore_buffer(again, buffer_state(buffer))
@@ -196,8 +240,7 @@ def test_a_way_that_cannot_be_is_refused_before_anything_is_lost(part, wrong):
 def test_what_is_known_no_more_pays_again():
     buffer = line_buffer()
     buffer.watch_ways({0: 5})
-    for step in range(14):
-        add(buffer, [step - 0.5], [step + 0.5], step == 13, success=False)
+    go_on(buffer)
     rows = buffer.trajectories(False)[0].rows
     for forget in (lambda: buffer.watch_ways({}), lambda: buffer.follow_modes([-1], []), lambda: buffer.expect_modes(1)):
         buffer.watch_ways({0: 5})
@@ -240,6 +283,31 @@ def test_explorers_past_an_able_mode_are_paid_nothing(explore_past_modes, able):
     stops = not explore_past_modes and bool(able)
     assert bool((rewards[EXPLORATORY_GROUP, -12:] == 0).all()) is bool(buffer.past_known_ways(past).any()) is stops
     assert (rewards[EXPLORATORY_GROUP, :5] > 0).all() and (rewards[1, -12:] > 0).all()
+
+
+@pytest.mark.parametrize("novelty", ["rnd", "counts"])
+def test_visits_past_a_way_are_taken_back_when_it_is_known(novelty):
+    """Counts become those of a run that had known it from the first; a network keeps what it has learned."""
+    kwargs = {"novelty_kwargs": {} if novelty == "rnd" else {"cell_size": 0.5}, "explore_past_modes": False}
+    model = planar_model(novelty=novelty, **kwargs)
+    walk(model, "up", 6)
+    model.recluster()
+    line = np.concatenate([np.linspace((0, 0), (0, 6), 7), np.linspace((1, 6), (18, 6), 18)]).astype(np.float32)
+    fill(model.replay_buffer, [line], False)
+    buffer = model.replay_buffer
+    rows = buffer._all.rows[: buffer.size()]
+    positions = buffer.features.of_tensors(buffer.read_observations(rows)[1])
+    model.novelty_model.observe(positions)
+    before = {name: value.clone() for name, value in model.novelty_model.state_dict().items()}
+    make_able(model, [0])
+    uncounted = buffer.past_known_ways(rows)
+    assert uncounted.any() and not uncounted.all()
+    if novelty == "counts":
+        expected = VisitCounts(2, 2, **kwargs["novelty_kwargs"])
+        expected.observe(positions[~uncounted])
+        before = expected.state_dict()
+    for name, value in model.novelty_model.state_dict().items():
+        assert th.equal(value, before[name]), name
 
 
 @pytest.mark.parametrize("explore_past_modes", [True, False])
