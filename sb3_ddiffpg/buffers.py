@@ -1,7 +1,6 @@
 """Replay buffer that knows modes, and stores target actions beside every action."""
 
 from collections.abc import Collection, Mapping, Sequence
-from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,12 +11,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
 from sb3_ddiffpg.dtw import LOOP_SHARE, N_PATH_POINTS, comparable_path
-from sb3_ddiffpg.features import ModeFeatures
-from sb3_ddiffpg.intrinsic import cell_entries
-from sb3_ddiffpg.known_ways import NO_WAY, KnownWays, Way, come_along
+from sb3_ddiffpg.exploration_buffer import ExplorationReplayBuffer, positive_length
+from sb3_ddiffpg.known_ways import NO_WAY, Way
 from sb3_ddiffpg.row_storage import Fields
 from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, Trajectory
-from sb3_ddiffpg.trajectory_buffer import TrajectoryReplayBuffer
 
 
 class ModeBatch(NamedTuple):
@@ -53,22 +50,14 @@ _MODE_SETTINGS = (
 )
 
 
-def _positive_length(name: str, length: Any) -> float | None:
-    if length is None:
-        return None
-    if not isinstance(length, Real) or isinstance(length, bool) or not 0 < float(length) < np.inf:
-        raise ValueError(f"{name} must be a positive and finite number, or None, got {length!r}")
-    return float(length)
-
-
 def _extent(positions: np.ndarray) -> float:
     """Diagonal of the box round positions of shape [..., dim]."""
     return float(np.linalg.norm(np.ptp(positions.reshape(-1, positions.shape[-1]), axis=0)))
 
 
-class ModeReplayBuffer(TrajectoryReplayBuffer):
+class ModeReplayBuffer(ExplorationReplayBuffer):
     """
-    A ``TrajectoryReplayBuffer`` whose trajectories belong to modes. Each row has two target actions: one for the mode that
+    An ``ExplorationReplayBuffer`` whose trajectories belong to modes. Each row has two target actions: one for the mode that
     owns its trajectory, one for the exploratory group.
 
     :param buffer_size: Capacity in transitions (over all environments)
@@ -107,8 +96,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
     off_route: np.ndarray
     way_novelty: np.ndarray
     goals: np.ndarray
-    first_visits: np.ndarray
-    followed: np.ndarray
 
     def __init__(
         self,
@@ -147,19 +134,17 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         ):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
-        self.features = ModeFeatures(observation_space, mode_features)
         self.max_successes_per_mode = max_successes_per_mode
         self.max_failures_per_mode = max_failures_per_mode
         self.max_length_ratio = max_length_ratio
         self.min_direct = min_direct
         self.n_path_points = n_path_points
         self.normalize_distances = normalize_distances
-        self.compared_length = _positive_length("compared_length", compared_length)
+        self.compared_length = positive_length("compared_length", compared_length)
         self.loop_share = loop_share
         self.route_share = route_share
         self.new_way_share = new_way_share
         self.explore_beyond_goals = explore_beyond_goals
-        self.visit_cell_size = _positive_length("visit_cell_size", visit_cell_size)
         super().__init__(
             buffer_size,
             observation_space,
@@ -170,6 +155,8 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             handle_timeout_termination=handle_timeout_termination,
             success_key=success_key,
             storage_device=storage_device,
+            mode_features=mode_features,
+            visit_cell_size=visit_cell_size,
         )
 
     # ------------------------------------------------------------------ storage
@@ -178,14 +165,10 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         """Forget everything and release the storage."""
         super().reset()
         self.owner: tuple[str, list[int]] = ("", [])  # run and numbers of its modes, noted when it is saved
-        self._feature_scale: np.ndarray | None = None
         self._distances = DistanceCache(self.normalize_distances)
         self._mode_position = np.empty(0, dtype=np.int32)
-        self._last_positions = np.empty((0, self.features.dim), dtype=np.float32)
         self.mode_rows: list[RowSet] = []
         self._new_way_rows = np.empty(0, dtype=np.int32)
-        self._episode_places: list[set[int]] = [set() for _ in range(self.n_envs)]
-        self._forget_ways()
 
     def _step_fields(self) -> Fields:
         action = ((self.action_dim,), np.float32)
@@ -193,12 +176,11 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
 
     def _note_fields(self) -> Fields:
         own: Fields = {"foreign": ((), bool), "off_route": ((), bool), "way_novelty": ((), np.float32), "goals": ((), bool)}
-        own["first_visits"], own["followed"] = ((), bool), ((), np.int32)
         return {**super()._note_fields(), **own}
 
     def _view_names(self) -> list[str]:
         own = ["target_actions", "exploratory_target_actions", "foreign", "off_route", "way_novelty", "goals"]
-        return [*super()._view_names(), *own, "first_visits", "followed"]
+        return [*super()._view_names(), *own]
 
     def _position_arrays(self) -> list[np.ndarray]:
         return [*super()._position_arrays(), self._mode_position]
@@ -209,16 +191,9 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         self.exploratory_target_actions = self._steps["exploratory_target_actions"]
         self.foreign, self.off_route = self._notes["foreign"], self._notes["off_route"]
         self.way_novelty, self.goals = self._notes["way_novelty"], self._notes["goals"]
-        self.first_visits, self.followed = self._notes["first_visits"], self._notes["followed"]
         self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
         for row_set in self.mode_rows:
             row_set.position = self._mode_position
-
-    def _check_step(self, obs: Any, next_obs: Any, *args: Any) -> None:
-        super()._check_step(obs, next_obs, *args)
-        positions = self.features(next_obs)
-        self.check_finite("mode features", positions)
-        self._last_positions = positions
 
     def _write_rows(self, rows: np.ndarray, obs: Any, next_obs: Any, action: np.ndarray, *args: Any) -> None:
         super()._write_rows(rows, obs, next_obs, action, *args)
@@ -226,49 +201,10 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             self._steps.write(name, rows, action)
         self.foreign[rows] = self.off_route[rows] = self.goals[rows] = False
         self.way_novelty[rows] = 0.0
-        if self.known_ways.ways:
-            self.known_ways.observe(np.arange(self.n_envs), self._last_positions / self._measured_scale())
-        self._last_followed = self.followed[rows] = self.known_ways.followed.copy()
-        if self.visit_cell_size is None:
-            self.first_visits[rows] = True
-            return
-        places = self._places(self._last_positions)
-        self.first_visits[rows] = [place not in seen for place, seen in zip(places, self._episode_places, strict=True)]
-        for place, seen in zip(places, self._episode_places, strict=True):
-            seen.add(place)
-
-    def _places(self, positions: np.ndarray) -> list[int]:
-        """The cell of each position, as a number."""
-        return cell_entries(th.from_numpy(positions), self.visit_cell_size or 1.0, 2**31).tolist()
-
-    def drop_unfinished_episodes(self) -> None:
-        """Forget the transitions of running episodes: call it when the environments were reset outside."""
-        super().drop_unfinished_episodes()
-        for env, seen in enumerate(self._episode_places):
-            seen.clear()
-            self.known_ways.forget(env)
-
-    def recall_places(self) -> None:
-        """After loading: where the running episodes have been."""
-        for env, (seen, length) in enumerate(zip(self._episode_places, self._running_length, strict=True)):
-            seen.clear()
-            if length and self.visit_cell_size is not None:
-                rows = self._running[env, :length]
-                seen.update(self._places(self._positions(self._nexts, "next_observations", rows)))
-        self._recall_ways()
-
-    def _recall_ways(self) -> None:
-        envs = np.repeat(np.arange(self.n_envs), self._running_length)
-        if self.known_ways.ways and len(envs):
-            rows = np.concatenate([self._running[env, :length] for env, length in enumerate(self._running_length)])
-            reached = self._positions(self._nexts, "next_observations", rows)
-            self.known_ways.observe(envs, reached / self._measured_scale())
 
     def _finish(self, env: int, info: dict[str, Any]) -> Trajectory:
         trajectory = super()._finish(env, info)
         self.goals[trajectory.rows[-1]] = trajectory.success
-        self._episode_places[env].clear()
-        self.known_ways.forget(env)
         return trajectory
 
     def _evict(self) -> Trajectory:
@@ -280,29 +216,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         return trajectory
 
     # ------------------------------------------------------------------ modes
-
-    def last_positions(self) -> np.ndarray:
-        """
-        :return: Mode features of the states reached by the latest ``add``, shape [n_envs, dim]
-        """
-        return self._last_positions
-
-    def counted_positions(self) -> np.ndarray:
-        """
-        :return: Those of ``last_positions`` whose visits count: not of an episode that came along a known way
-        """
-        return self._last_positions[self._last_followed == NO_WAY]
-
-    def past_known_ways(self, rows: np.ndarray) -> np.ndarray:
-        """
-        :param rows: Any shape
-        :return: Which of them are of an episode that had come along a way that is known still, same shape
-        """
-        return self.known_ways.include(self.followed[rows])
-
-    def _forget_ways(self) -> None:
-        self.known_ways = KnownWays(self.n_envs)
-        self._last_followed = self.known_ways.followed.copy()
 
     def expect_modes(self, n_modes: int) -> None:
         """
@@ -322,8 +235,7 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         :param new_modes: New index of every mode so far, ``NO_MODE`` if the model does not have it
         :param numbers: Numbers of the model's modes
         """
-        self.known_ways.replace([way for way in self.known_ways.ways if way.number in numbers])
-        self._recall_ways()
+        self._watch([way for way in self.known_ways.ways if way.number in numbers])
         stored = self.trajectories(success=True) + self.trajectories(success=False)
         for trajectory in stored:
             if trajectory.foreign and trajectory.commanded not in numbers:
@@ -381,23 +293,6 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         first = self._positions(self._steps, "observations", trajectory.rows)
         last = self._positions(self._nexts, "next_observations", trajectory.rows[-1:])
         return np.concatenate((first, last))
-
-    def _positions(self, part: Any, name: str, rows: np.ndarray) -> np.ndarray:
-        """Mode features at the rows, shape [N, dim]."""
-        return self.features.of_tensors(self._as_observation(part.tensors(rows), name)).cpu().numpy()
-
-    def _measured_scale(self) -> np.ndarray:
-        if self._feature_scale is None:
-            self._feature_scale = self._measure_scale()
-        return self._feature_scale
-
-    def _measure_scale(self) -> np.ndarray:
-        """Declared positions keep their unit; a whole observation is standardised once, or cached distances would age."""
-        if not self.features.whole_observation:
-            return np.ones(self.features.dim, dtype=np.float32)
-        rows = self._all.rows[: min(self._all.size, 50_000)]
-        deviation = self._positions(self._steps, "observations", rows).std(axis=0)
-        return np.where(deviation > 1e-6, deviation, 1.0).astype(np.float32)
 
     def success_distances(self, successes: list[Trajectory]) -> np.ndarray:
         """
@@ -467,12 +362,16 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
             self.followed[rows] = NO_WAY
         self._new_way_rows = np.concatenate([self._new_way_rows[:0], *new_ways])
 
+    def _training(self, mode: int) -> list[Trajectory]:
+        """Goal-reached trajectories that train a mode by its own way."""
+        return [each for each in self.trajectories(success=True) if each.trains and each.mode == mode]
+
     def places_of(self, modes: Collection[int]) -> th.Tensor:
         """
         :param modes: Indices of modes
         :return: Where the goal-reached trajectories go that train one of these by its own way, [N, features.dim]
         """
-        rows = [each.rows for each in self.trajectories(success=True) if each.trains and each.mode in modes]
+        rows = [each.rows for mode in modes for each in self._training(mode)]
         if not rows:
             return th.empty(0, self.features.dim)
         return self.features.of_tensors(self.read_observations(np.concatenate(rows))[1])
@@ -487,30 +386,12 @@ class ModeReplayBuffer(TrajectoryReplayBuffer):
         """
         ways = []
         for mode, number in modes.items():
-            members = [each for each in self.trajectories(success=True) if each.trains and each.mode == mode]
-            if members:
+            if members := self._training(mode):
                 paths = np.stack([self.path(each) for each in members])
                 ways.append(Way(number, paths, self.route_share * _extent(paths)))
-        unknown = [way for way in ways if way.number not in self.known_ways.numbers()]
-        self.known_ways.replace(ways)
-        noted = self._note_past(unknown) if unknown else np.empty(0, dtype=np.int32)
-        self._recall_ways()
-        return noted
-
-    def _note_past(self, ways: list[Way]) -> np.ndarray:
-        """``followed`` of the episodes that are here, running ones too; the rows of which it is changed from none."""
-        finished = [*self.trajectories(success=True), *self.trajectories(success=False), *self._retired]
         # One that is a new way to a goal keeps its worth, however it began
-        episodes = [each.rows for each in finished if self.way_novelty[each.rows[-1]] == 0]
-        episodes += [self._running[env, :length] for env, length in enumerate(self._running_length) if length]
-        changed = []
-        for rows in episodes:
-            reached = self._positions(self._nexts, "next_observations", rows) / self._measured_scale()
-            followed = come_along(ways, reached)
-            came = (followed != NO_WAY) & ~self.past_known_ways(rows)
-            changed.append(rows[came & (self.followed[rows] == NO_WAY)])
-            self.followed[rows[came]] = followed[came]
-        return np.concatenate([np.empty(0, dtype=np.int32), *changed])
+        finished = [*self.trajectories(success=True), *self.trajectories(success=False), *self._retired]
+        return self._watch(ways, [each.rows for each in finished if self.way_novelty[each.rows[-1]] == 0])
 
     def _split_detours(self, trajectories: list[Trajectory]) -> tuple[list[Trajectory], list[Trajectory]]:
         """
