@@ -179,7 +179,7 @@ def test_settings_are_looked_at_again_under_the_lock(monkeypatch, tmp_path):
             (tmp_path / "config.yml").write_text(yaml.safe_dump(record))
             return super().__enter__()
 
-    monkeypatch.setattr("sb3_ddiffpg.experiments.trial.FileLock", LateLock)
+    monkeypatch.setattr("sb3_ddiffpg.experiments.training.FileLock", LateLock)
     with pytest.raises(ValueError, match="holds another training"):
         record(monkeypatch, tmp_path, "--env", "PointMazeV1-v0", "--seed", "1", "--override", SMALL)
     assert not (tmp_path / "model.zip").exists()

@@ -15,9 +15,9 @@ from sb3_ddiffpg.experiments import __main__ as cli
 from sb3_ddiffpg.experiments import execution
 from sb3_ddiffpg.experiments.execution import LocalExecutor, TrialFailed, command_of
 from sb3_ddiffpg.experiments.progress import Progress, read_progress, write_progress
+from sb3_ddiffpg.experiments.record import is_complete, recorded_trial
 from sb3_ddiffpg.experiments.run import missing_trials, run_suite
 from sb3_ddiffpg.experiments.suite import Resources, read_suite, suite_names
-from sb3_ddiffpg.experiments.trial import is_complete, recorded_trial
 
 TINY = """
 description: Two algorithms, hardly trained

@@ -11,7 +11,7 @@ COMMANDS = {
     "card": "a model card for Hugging Face, beside a recorded training's model",
     "upload": "a recorded training to Hugging Face",
 }
-_MODULES = {"upload": "card"}
+_MODULES = {"trial": "training", "upload": "card"}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

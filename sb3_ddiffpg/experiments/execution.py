@@ -8,8 +8,9 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, Protocol
 
+from sb3_ddiffpg.experiments.record import command_line
 from sb3_ddiffpg.experiments.suite import Resources
-from sb3_ddiffpg.experiments.trial import Trial, command_line
+from sb3_ddiffpg.experiments.trial import Trial
 
 # Every library that would otherwise take all cores
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")

@@ -16,8 +16,9 @@ from rich.progress import Progress as Bars
 
 from sb3_ddiffpg.experiments.execution import Executor, LocalExecutor, RayExecutor, TrialFailed
 from sb3_ddiffpg.experiments.progress import read_progress
+from sb3_ddiffpg.experiments.record import check_folder, has_record, is_complete
 from sb3_ddiffpg.experiments.suite import Suite, read_suite, suite_names
-from sb3_ddiffpg.experiments.trial import Trial, check_folder, is_complete
+from sb3_ddiffpg.experiments.trial import Trial
 
 _SECONDS_BETWEEN_LOOKS = 0.5
 
@@ -103,7 +104,7 @@ def run_suite(name: str, suite: Suite, folder: Path, executor: Executor) -> dict
     try:
         with view.shown():
             # What is half done comes first
-            order = sorted(trials, key=lambda place: not (folder / place / "config.yml").is_file())
+            order = sorted(trials, key=lambda place: not has_record(folder / place))
             waiting: dict[Future[None], Path] = {}
             for place in order:
                 waiting[executor.submit(trials[place], folder / place, suite.resources)] = place

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import yaml
 from msgspec.structs import replace
 
 from sb3_ddiffpg.evaluation import ModeEvaluation
-from sb3_ddiffpg.experiments.trial import Trial, recorded_trial
+from sb3_ddiffpg.experiments.record import has_record, read_record, recorded_trial
+from sb3_ddiffpg.experiments.trial import Trial
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ def read_results(folder: Path) -> tuple[list[Recorded], list[Path]]:
     :raises ValueError: If there is none at all
     """
     complete, others = [], []
-    for place, folders, files in os.walk(folder):
+    for place, folders, _ in os.walk(folder):
         folders.sort()
-        if "config.yml" not in files:
+        if not has_record(Path(place)):
             continue
         folders.clear()  # what lies below are members of a union, and logs
         record = _record(Path(place))
@@ -69,7 +69,7 @@ def read_training(folder: Path) -> Recorded:
     :return: The training
     :raises ValueError: If it is no such folder
     """
-    record = _record(folder) if (folder / "config.yml").is_file() else None
+    record = _record(folder)
     found = None if record is None else _read(folder, record)
     if found is None:
         raise ValueError(f"{folder} given; accepted is the folder of a complete training")
@@ -77,12 +77,11 @@ def read_training(folder: Path) -> Recorded:
 
 
 def _record(folder: Path) -> dict[str, Any] | None:
-    """None if the file is damaged, or somebody else's: the zoo's have the same name."""
+    """None if there is none, or it is damaged."""
     try:
-        record = yaml.safe_load((folder / "config.yml").read_text())
-    except (yaml.YAMLError, UnicodeDecodeError):
+        return read_record(folder)
+    except ValueError:
         return None
-    return record if isinstance(record, dict) and {"algo", "env", "seed", "hyperparams"} <= set(record) else None
 
 
 def _read(folder: Path, record: dict[str, Any]) -> Recorded | None:
