@@ -15,6 +15,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg.baselines import RPG
+from sb3_ddiffpg.evaluation import ModeEvaluation
+from sb3_ddiffpg.experiments import __main__ as cli
 
 
 def small(env=None, **changes):
@@ -218,3 +220,13 @@ def test_it_keeps_both_arms_of_a_bandit(seed):
     left, right = (np.mean(np.abs(actions - arm) < 0.15) for arm in (-0.6, 0.6))
     print(f"seed {seed}: {left:.2f} and {right:.2f} of the actions at the arms")
     assert min(left, right) > 0.3 and left + right > 0.75, (left, right)
+
+
+@pytest.mark.slow
+def test_a_sparse_point_maze(tmp_path):
+    """Half of the zoo's steps; the best model of fifteen tests, in fresh episodes. Untrained, one in twenty succeeds."""
+    command = ["trial", "--algo", "rpg", "--env", "PointMazeV1-v0", "--override", "{n_timesteps: 75000}"]
+    cli.main([*command, "--tests", "{n_tests: 15, n_episodes: 50}", "--out", str(tmp_path)])
+    found = ModeEvaluation.load(tmp_path / "evaluation.json")
+    print(found)
+    assert found.uncommanded.success_rate > 0.9
