@@ -89,6 +89,10 @@ class NoveltyActorCritic(SavableAlgorithm):
     """
 
     default_replay_buffer_class: ClassVar[type[ModeReplayBuffer]] = ModeReplayBuffer
+    target_networks: ClassVar[dict[str, str]] = {
+        "critics_target": "critics",
+        "critic_features_extractor_target": "critic_features_extractor",
+    }
     policy: TwinCriticPolicy
     actor: Any
     replay_buffer: ModeReplayBuffer

@@ -11,8 +11,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.save_util import load_from_zip_file
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_ddiffpg.actor_critic import NoveltyActorCritic
@@ -610,23 +609,15 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         """
         self._behavior.load_state_dict(tree, len(self._modes))
 
-    def set_parameters(
-        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
-    ) -> None:
-        """
-        See SB3. The number of modes follows the given parameters; if it changes, nobody knows which modes these are: they
-        get new names and wait for trajectories.
-        """
-        params: Any = load_path_or_dict
-        if not isinstance(params, dict):
-            _, params, _ = load_from_zip_file(params, device=device, load_data=False)
-        policy = params.get("policy", {})
+    def _set_parameters(self, parameters: Any, exact_match: bool, device: th.device | str) -> None:
+        """The number of modes follows; if it changes, nobody knows which modes these are: they get new names and wait."""
+        policy = parameters.get("policy", {})
         n_modes = len(policy["mode_embeddings"]) - 1 if "mode_embeddings" in policy else len(self._modes)
         # What does not fit is refused by SB3; it must not cost the modes before that
-        complete = not exact_match or set(params) == set(self._get_torch_save_params()[0])
+        complete = not exact_match or set(parameters) == set(self._get_torch_save_params()[0])
         if n_modes != len(self._modes) and complete and self.policy.fits_but_for_modes(policy):
             self._expect_unknown_modes(n_modes)
-        super().set_parameters(params, exact_match, device)
+        super()._set_parameters(parameters, exact_match, device)
 
     def _expect_unknown_modes(self, n_modes: int) -> None:
         self.policy.resize(n_modes)

@@ -57,6 +57,24 @@ def test_saves_loads_and_goes_on(algorithm, tmp_path):
     assert loaded.num_timesteps >= model.num_timesteps + 60 and loaded._n_updates > model._n_updates
 
 
+def test_saved_without_what_only_training_needs(algorithm, tmp_path):
+    """It acts as before, also where it draws, and its target networks begin anew."""
+    model = small(algorithm, **({} if algorithm is RPG else {"actor_tau": 0.1}))
+    model.learn(200)
+    model.save(tmp_path / "model", to_train=False)
+    loaded = algorithm.load(tmp_path / "model")
+    obs = np.random.default_rng(0).uniform(-1, 1, (5, 2)).astype(np.float32)
+    drawn = []
+    for each in (model, loaded):
+        th.manual_seed(0)
+        drawn.append(each.predict(obs)[0])
+    np.testing.assert_array_equal(*drawn)
+    for target, online in algorithm.target_networks.items():
+        followed = getattr(model.policy, online).state_dict()
+        for name, value in getattr(loaded.policy, target).state_dict().items():
+            assert th.equal(value, followed[name]), (target, name)
+
+
 @pytest.mark.parametrize("space", [spaces.Discrete(3), image_dict_space(), spaces.Box(0, 255, (1, 36, 36), dtype=np.uint8)])
 def test_observations(algorithm, space):
     policy = "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy"

@@ -81,6 +81,7 @@ class Baseline(NoveltyActorCritic):
     """
 
     default_replay_buffer_class = FifoReplayBuffer
+    target_networks: ClassVar[dict[str, str]] = {**NoveltyActorCritic.target_networks, "actor_target": "actor"}
     policy: BaselinePolicy
 
     def __init__(self, policy: str | type[BasePolicy], env: Any, *, actor_tau: float | None = None, **kwargs: Any) -> None:

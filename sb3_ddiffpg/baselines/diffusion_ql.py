@@ -32,6 +32,7 @@ class DiffusionQL(Baseline):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(DiffusionActorPolicy)
+    target_networks: ClassVar[dict[str, str]] = {"actor_target": "actor"}  # it acts by the target critics
 
     def __init__(
         self,

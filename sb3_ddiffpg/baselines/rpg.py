@@ -314,6 +314,7 @@ class RPG(EntropyTuning):
     default_replay_buffer_class = FifoReplayBuffer
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(RPGPolicy)
     _counters: ClassVar[dict[str, Any]] = {"_n_model_updates": int}
+    target_networks: ClassVar[dict[str, str]] = {"model_target": "model"}
     policy: RPGPolicy  # type: ignore[assignment]
 
     def __init__(

@@ -159,8 +159,8 @@ class _Training:
             found = evaluate_modes(tested, env, n_episodes, seed=seed)
             found.save(self.folder / ("evaluation.json" if name == "best" else "logs/evaluation_final.json"))
             if name == "best" and isinstance(tested, NoveltyActorCritic):
-                smaller = self.logs / "model_without_optimizers.zip"
-                tested.save(smaller, optimizers=False)
+                smaller = self.logs / "model_to_act.zip"
+                tested.save(smaller, to_train=False)
                 os.replace(smaller, path)  # there is no other copy
             print(f"\n{name} model\n{found}")
         for env_id in self.trial.tests.also:
