@@ -14,6 +14,7 @@ UNCONDITIONED = -1
 
 class _State(msgspec.Struct, forbid_unknown_fields=True):
     groups: np.ndarray
+    explored: np.ndarray
     handed_over: np.ndarray
     may_hand_over: np.ndarray
     n_turns: int
@@ -22,18 +23,23 @@ class _State(msgspec.Struct, forbid_unknown_fields=True):
 class Behavior:
     """
     The group that drives each environment. It is drawn at an episode's beginning and kept through it: redrawn at every step
-    it would mix several in one trajectory. Only an exploring episode may hand over, once, to a mode or the zero embedding.
+    it would mix several in one trajectory. Only once may an episode hand over: an exploring one to a mode or the zero
+    embedding, one that follows a mode to another mode.
 
     :param n_envs: Number of environments
     """
 
     def __init__(self, n_envs: int) -> None:
         self.groups = np.zeros(n_envs, dtype=np.int64)
+        #: Whether the episode began exploring, has handed over, and may yet
+        self.explored = np.zeros(n_envs, dtype=bool)
         self.handed_over = np.zeros(n_envs, dtype=bool)
         self.may_hand_over = np.zeros(n_envs, dtype=bool)
         self.n_turns = 0
 
-    def begin_all(self, n_envs: int, n_modes: int, exploration_share: float, explore_then_exploit: float) -> None:
+    def begin_all(
+        self, n_envs: int, n_modes: int, exploration_share: float, explore_then_exploit: float, switch_modes: float = 0.0
+    ) -> None:
         """
         New episodes everywhere.
 
@@ -41,12 +47,16 @@ class Behavior:
         :param n_modes: Number of modes M
         :param exploration_share: Probability that an episode explores
         :param explore_then_exploit: Probability that an exploring episode may hand over
+        :param switch_modes: Probability that one that follows a mode may
         """
-        self.groups = np.array([self.draw(n_modes, exploration_share) for _ in range(n_envs)], dtype=np.int64)
-        self.handed_over = np.zeros(n_envs, dtype=bool)
-        self.may_hand_over = np.random.rand(n_envs) < explore_then_exploit
+        self.groups = np.zeros(n_envs, dtype=np.int64)
+        self.explored, self.handed_over, self.may_hand_over = (np.zeros(n_envs, dtype=bool) for _ in range(3))
+        for env in range(n_envs):
+            self.begin(env, n_modes, exploration_share, explore_then_exploit, switch_modes)
 
-    def begin(self, env: int, n_modes: int, exploration_share: float, explore_then_exploit: float) -> None:
+    def begin(
+        self, env: int, n_modes: int, exploration_share: float, explore_then_exploit: float, switch_modes: float = 0.0
+    ) -> None:
         """
         A new episode in one environment.
 
@@ -54,10 +64,13 @@ class Behavior:
         :param n_modes: Number of modes M
         :param exploration_share: Probability that the episode explores
         :param explore_then_exploit: Probability that it may hand over if it explores
+        :param switch_modes: Probability that it may if it follows a mode
         """
-        self.groups[env] = self.draw(n_modes, exploration_share)
+        self.groups[env] = group = self.draw(n_modes, exploration_share)
+        self.explored[env] = group == EXPLORATORY_GROUP
         self.handed_over[env] = False
-        self.may_hand_over[env] = np.random.rand() < explore_then_exploit
+        share = {EXPLORATORY_GROUP: explore_then_exploit, UNCONDITIONED: 0.0}.get(group, switch_modes)
+        self.may_hand_over[env] = np.random.rand() < share
 
     def draw(self, n_modes: int, exploration_share: float) -> int:
         """
@@ -76,23 +89,36 @@ class Behavior:
 
     def hand_over(self, n_modes: int, probability: float) -> None:
         """
-        End the exploring part of some episodes.
+        Let some episodes go on with another group.
 
         :param n_modes: Number of modes M
         :param probability: Of each episode that may hand over
         """
         leaves = self.may_hand_over & (np.random.rand(len(self.groups)) < probability)
-        for env in np.flatnonzero(leaves & (self.groups == EXPLORATORY_GROUP)):
-            self.groups[env] = self._next_in_turn(n_modes)
-            self.handed_over[env] = True
+        for env in np.flatnonzero(leaves):
+            group = int(self.groups[env])
+            if group == EXPLORATORY_GROUP:
+                self.groups[env] = self._next_in_turn(n_modes)
+            elif group > EXPLORATORY_GROUP and n_modes > 1:
+                self.groups[env] = (group + np.random.randint(1, n_modes) - 1) % n_modes + 1
+            else:
+                continue
+            self.handed_over[env], self.may_hand_over[env] = True, False
+
+    def told_mode(self, env: int) -> int | None:
+        """
+        :param env: Index of the environment
+        :return: The mode that its episode is told to follow, None if none is or it began exploring
+        """
+        group = int(self.groups[env])
+        return group - 1 if group > EXPLORATORY_GROUP and not self.explored[env] else None
 
     def commanded_mode(self, env: int) -> int | None:
         """
         :param env: Index of the environment
         :return: The mode that has driven its episode from the beginning, None if none has
         """
-        group = int(self.groups[env])
-        return group - 1 if group > EXPLORATORY_GROUP and not self.handed_over[env] else None
+        return None if self.handed_over[env] else self.told_mode(env)
 
     def follow(self, new_modes: list[int | None]) -> None:
         """
@@ -117,7 +143,7 @@ class Behavior:
         """
         known = convert(state, _State, "behavior")
         check_array(known.groups, np.int64, [None], "behavior.groups")
-        for name in ("handed_over", "may_hand_over"):
+        for name in ("explored", "handed_over", "may_hand_over"):
             check_array(getattr(known, name), bool, known.groups.shape, f"behavior.{name}")
         if len(known.groups) and not UNCONDITIONED <= known.groups.min() <= known.groups.max() <= n_modes:
             raise ValueError(

@@ -105,6 +105,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param exploration_fraction: Part of the training that explores, when ``exploration_share`` is None
     :param explore_then_exploit: Share of the exploring episodes that hand over to a mode or the zero embedding after a random
         time (on average the modes' mean length), so that they come to a goal by a way that no mode would have taken
+    :param switch_modes: Share of the episodes that follow a mode and go on with another one after such a time, so that a mode
+        learns to come back from where others lead, which a ``Replanner`` asks of it
     :param explore_beyond_goals: Whether a goal does not end the exploratory critics' returns: novelty is not episodic
         (Burda et al., 2018, section 2.3), and explorers would keep away from where it ends
     :param novelty: ``"rnd"``, ``"counts"``, or a class with the methods of ``RandomNetworkDistillation``
@@ -202,6 +204,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         exploration_share: float | Schedule | None = None,
         exploration_fraction: float = 0.7,
         explore_then_exploit: float = 0.5,
+        switch_modes: float = 0.0,
         explore_beyond_goals: bool = True,
         novelty: str | type = "counts",
         novelty_kwargs: dict[str, Any] | None = None,
@@ -292,6 +295,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         self.exploration_share = exploration_share
         self.exploration_fraction = exploration_fraction
         self.explore_then_exploit = explore_then_exploit
+        self.switch_modes = switch_modes
         self.explore_beyond_goals = explore_beyond_goals
         self.explore_off_modes = explore_off_modes
         self.explore_past_modes = explore_past_modes
@@ -542,15 +546,20 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             return 1 / (len(self._modes) + 1) if 1 - progress_remaining < self.exploration_fraction else 0.0
         return float(FloatSchedule(self.exploration_share)(progress_remaining))
 
+    def _shares(self) -> tuple[float, float, float]:
+        """Of episodes that explore, that hand over when they do, and that change their mode."""
+        return self._exploration_share(), self.explore_then_exploit, self.switch_modes
+
     def _store_transition(self, replay_buffer: ModeReplayBuffer, *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
         super()._store_transition(replay_buffer, *args, **kwargs)
         for env, trajectory in replay_buffer.just_finished:
+            told = self._behavior.told_mode(env)
+            trajectory.commanded = None if told is None else self._modes[told].number
             mode = self._behavior.commanded_mode(env)
             if mode is not None:
-                trajectory.commanded = self._modes[mode].number
                 self._modes[mode].outcomes.append(Outcome(trajectory.success, trajectory.episode_return, trajectory.length))
                 self._modes[mode].unjudged += 1
-            self._behavior.begin(env, len(self._modes), self._exploration_share(), self.explore_then_exploit)
+            self._behavior.begin(env, len(self._modes), *self._shares())
 
     # ------------------------------------------------------------------ a run's beginning
 
@@ -562,7 +571,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         return prepared
 
     def _begin_episodes(self) -> None:
-        self._behavior.begin_all(self.n_envs, len(self._modes), self._exploration_share(), self.explore_then_exploit)
+        self._behavior.begin_all(self.n_envs, len(self._modes), *self._shares())
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         callbacks = callback if isinstance(callback, list) else [callback]

@@ -46,7 +46,7 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     (("learning_starts", "mode_patience"), "be an integer of at least 0", lambda value: _is_integer(value) and value >= 0),
     (("gradient_steps",), "be an integer of at least -1", lambda value: _is_integer(value) and value >= -1),
     (
-        ("gamma", "tau", "mode_mask_prob", "exploration_fraction", "explore_then_exploit", "min_return_ratio"),
+        ("gamma", "tau", "mode_mask_prob", "exploration_fraction", "explore_then_exploit", "switch_modes", "min_return_ratio"),
         "lie in [0, 1]",
         _is_share,
     ),

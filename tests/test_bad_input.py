@@ -43,6 +43,7 @@ BAD_ARGUMENTS = [
         for value in (-0.1, None, "x", np.nan)
     ),
     *((name, value) for name in ("learning_rate", "qf_learning_rate") for value in (-1e-3, "lin_3e-4x", np.nan)),
+    *(("switch_modes", value) for value in (-0.1, 1.1, "x", np.nan)),
     *(("exploration_gamma", value) for value in (-0.1, 1.1, "x", np.nan)),
     *(("exploration_share", value) for value in (-0.1, 1.5, "half")),
     *(("distance_threshold", value) for value in (0, -1.0, "auto", np.nan)),

@@ -592,7 +592,7 @@ def test_exploring_episodes_hand_over(may_hand_over):
     np.random.seed(0)
     behavior = Behavior(6000)
     behavior.groups = np.repeat([EXPLORATORY_GROUP, 1], 3000)
-    behavior.may_hand_over[:] = may_hand_over
+    behavior.may_hand_over[:3000] = may_hand_over
     behavior.hand_over(n_modes=2, probability=0.2)
     left = behavior.groups[:3000] != EXPLORATORY_GROUP
     np.testing.assert_array_equal(behavior.handed_over[:3000], left)
@@ -600,6 +600,51 @@ def test_exploring_episodes_hand_over(may_hand_over):
     assert left.mean() == pytest.approx(0.2 * may_hand_over, abs=0.02)
     # Nobody commanded these from their beginning
     assert {behavior.commanded_mode(env) for env in range(3000)} == {None} and behavior.commanded_mode(3000) == 0
+
+
+def test_episodes_that_follow_a_mode_switch_to_another_once():
+    np.random.seed(0)
+    behavior = Behavior(6000)
+    behavior.groups[:] = 2
+    behavior.may_hand_over[:3000] = True
+    behavior.hand_over(n_modes=3, probability=1.0)
+    counts = Counter(behavior.groups[:3000].tolist())
+    assert counts.keys() == {1, 3} and abs(counts[1] - counts[3]) < 200 and (behavior.groups[3000:] == 2).all()
+    # A trajectory belongs to the mode that it was told to follow in the end, but no mode's success is judged by it
+    assert {behavior.told_mode(env) for env in range(3000)} == {0, 2}
+    assert {behavior.commanded_mode(env) for env in range(3000)} == {None} and behavior.commanded_mode(3000) == 1
+    before = behavior.groups.copy()
+    behavior.hand_over(n_modes=3, probability=1.0)
+    np.testing.assert_array_equal(behavior.groups, before)
+
+
+def test_only_one_mode_is_switched_to_none():
+    behavior = Behavior(10)
+    behavior.groups[:], behavior.may_hand_over[:] = 1, True
+    behavior.hand_over(n_modes=1, probability=1.0)
+    assert (behavior.groups == 1).all() and not behavior.handed_over.any()
+
+
+@pytest.mark.parametrize("explored", [False, True])
+def test_a_trajectory_belongs_to_the_mode_that_was_followed_last(two_routes, explored):
+    model, behavior = two_routes, two_routes._behavior
+    behavior.groups[:], behavior.handed_over[:], behavior.explored[:] = 2, True, explored
+    model._last_obs = model._last_original_obs = model.env.reset()
+    n_outcomes = len(model.modes[1].outcomes)
+    action, reward = np.zeros((1, *model.action_space.shape), dtype=np.float32), np.zeros(1)
+    model._store_transition(model.replay_buffer, action, model._last_obs, reward, np.ones(1, dtype=bool), [{}])
+    ((_, trajectory),) = model.replay_buffer.just_finished
+    assert trajectory.commanded == (None if explored else model.modes[1].number)
+    assert len(model.modes[1].outcomes) == n_outcomes and not behavior.handed_over.any()
+
+
+def test_who_may_hand_over():
+    np.random.seed(0)
+    behavior = Behavior(0)
+    behavior.begin_all(9000, 2, 0.4, 0.7, 0.2)
+    for group, share in ((EXPLORATORY_GROUP, 0.7), (UNCONDITIONED, 0.0), (1, 0.2), (2, 0.2)):
+        assert behavior.may_hand_over[behavior.groups == group].mean() == pytest.approx(share, abs=0.03)
+    np.testing.assert_array_equal(behavior.explored, behavior.groups == EXPLORATORY_GROUP)
 
 
 def test_exploring_episodes_take_as_long_as_a_mode(two_routes):
@@ -610,10 +655,10 @@ def test_exploring_episodes_take_as_long_as_a_mode(two_routes):
     assert asked == [(2, pytest.approx(1 / mean_length))]
 
 
-@pytest.mark.parametrize("explore_then_exploit", [0.0, 0.5, 1.0])
-def test_success_rates_are_those_of_commanded_episodes(explore_then_exploit):
+@pytest.mark.parametrize(("explore_then_exploit", "switch_modes"), [(0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (0.5, 0.5)])
+def test_success_rates_are_those_of_commanded_episodes(explore_then_exploit, switch_modes):
     """Counted by hand while the model trains: episodes that followed one mode from their beginning."""
-    arguments = {"exploration_share": 0.4, "explore_then_exploit": explore_then_exploit}
+    arguments = {"exploration_share": 0.4, "explore_then_exploit": explore_then_exploit, "switch_modes": switch_modes}
     model = small_model(DummyVecEnv([TwoEnds] * 3), **arguments)
     followed, outcomes = [[] for _ in range(3)], {}
 
