@@ -140,6 +140,15 @@ class _PeriodicCallback(BaseCallback):
         raise NotImplementedError
 
 
+def score(found: ModeEvaluation) -> tuple[float, int, float]:
+    """
+    :param found: What ``evaluate_modes`` found
+    :return: By which models are compared: their ``commanded_modes``, the number of modes, and uncommanded success. A model
+        whose modes fail yet is more than luck without any
+    """
+    return found.commanded_modes, len(found.commanded), found.uncommanded.success_rate
+
+
 class EvaluateModesCallback(_PeriodicCallback):
     """
     Runs :func:`~sb3_ddiffpg.evaluation.evaluate_modes` during training and logs what follows from it under ``eval_modes/``.
@@ -150,8 +159,7 @@ class EvaluateModesCallback(_PeriodicCallback):
     :param n_episodes: Episodes for each command, and twice as many without
     :param path: Of a file to which each evaluation is appended, one line of JSON each
     :param best_model_path: Of a .zip file, where the model is saved (and ``vecnormalize.pkl`` beside it) whenever its
-        ``commanded_modes``, then its number of modes, then its uncommanded successes, are as many as ever before. Evaluate it
-        again, in fresh episodes, before you report it: it was chosen for these
+        ``score`` is as high as ever before. Before you report it, evaluate it in fresh episodes: it was chosen for these
     :param kwargs: Further arguments of ``evaluate_modes``
     """
 
@@ -227,13 +235,13 @@ class EvaluateModesCallback(_PeriodicCallback):
         if self.path is not None:
             with self.path.open("a") as file:
                 file.write(self._line(self.num_timesteps, found))
-        # A model whose modes fail yet is more than luck without any, and of equals the later one has seen more
-        score = (found.commanded_modes, len(found.commanded), found.uncommanded.success_rate)
-        if self.best_model_path is not None and score >= self._best:
+        # Of equals the later one has seen more
+        reached = score(found)
+        if self.best_model_path is not None and reached >= self._best:
             unfinished = self.best_model_path.with_name(f".{self.best_model_path.stem}.zip")
             self.model.save(unfinished)
             os.replace(unfinished, self.best_model_path)  # whole, or the one before
-            self._best, self.best_step = score, self.num_timesteps
+            self._best, self.best_step = reached, self.num_timesteps
             normalizer = self.model.get_vec_normalize_env()
             if normalizer is not None:
                 normalizer.save(str(self.best_model_path.with_name("vecnormalize.pkl")))

@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 import pytest
+import torch as th
 import yaml
 from filelock import FileLock
 
@@ -50,6 +51,22 @@ def test_a_run_leaves_its_record_and_can_be_repeated(monkeypatch, tmp_path, caps
     with pytest.raises(SystemExit):
         record(monkeypatch, tmp_path / "a", "--env", "PointMazeV1-v0", "--seed", "6", "--override", SMALL)
     assert "holds another training" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("final", [0.5, 1.5])
+def test_the_last_model_is_kept_where_it_does_better(monkeypatch, tmp_path, final):
+    """In tests the first model does best; with more episodes the last one has ``final``, the first 1."""
+    tests, validation = iter([3.0, 2.0, 1.0]), iter([final, 1.0])
+    monkeypatch.setattr("sb3_ddiffpg.callbacks.score", lambda found: (next(tests), 0, 0.0))
+    monkeypatch.setattr("sb3_ddiffpg.experiments.training.score", lambda found: (next(validation), 0, 0.0))
+    found = record(monkeypatch, tmp_path, "--env", "PointMazeV1-v0", "--override", SMALL)
+    with (tmp_path / "curve.csv").open() as file:
+        steps = [int(row["step"]) for row in csv.DictReader(file)]
+    assert found["result"]["best_step"] == steps[-1 if final > 1 else 0]
+    kept, last = (DDiffPG.load(tmp_path / name) for name in ("model.zip", "logs/final_model.zip"))
+    pairs = zip(kept.actor.parameters(), last.actor.parameters(), strict=True)
+    assert all(th.equal(*pair) for pair in pairs) is (final > 1)
+    assert next(tests, None) is next(validation, None) is None
 
 
 def test_a_simulators_processes_count_as_the_runs():

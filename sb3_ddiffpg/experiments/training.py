@@ -20,6 +20,7 @@ from filelock import FileLock, Timeout
 from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalization
 
 from sb3_ddiffpg.actor_critic import NoveltyActorCritic
+from sb3_ddiffpg.callbacks import score
 from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
@@ -142,21 +143,40 @@ class _Training:
         model.save(self.logs / "final_model.zip")
         if curve.best_step is None:
             shutil.copy(self.logs / "final_model.zip", self.folder / "model.zip")
+        elif curve.best_step < model.num_timesteps and self._final_is_better(test_env):
+            result["best_step"] = model.num_timesteps
         self._evaluate(test_env, manager.eval_env_kwargs)
         test_env.close()
         self._write_record({**result, "complete": True})
         shutil.rmtree(checkpoints, ignore_errors=True)
         write_progress(self.logs, Progress(model.num_timesteps, manager.n_timesteps, "done"))
 
+    def _final_is_better(self, test_env: Any) -> bool:
+        """Then it takes the place of the model that did best in a test, of few episodes: both are compared in more."""
+        seed, paths = self.trial.seed + 750, (self.logs / "final_model.zip", self.folder / "model.zip")
+        final, best = (score(self._tested(path, test_env, seed)[1]) for path in paths)
+        if final < best:
+            return False
+        unfinished = self.logs / "model.zip"
+        shutil.copy(paths[0], unfinished)
+        os.replace(unfinished, paths[1])
+        if isinstance(test_env, VecNormalize):
+            test_env.save(str(self.folder / "vecnormalize.pkl"))
+        return True
+
+    def _tested(self, path: Path, test_env: Any, seed: int) -> tuple[Any, ModeEvaluation]:
+        """The model of a file, and what was found of it."""
+        statistics, env = path.with_name("vecnormalize.pkl"), test_env
+        if isinstance(test_env, VecNormalize) and statistics.exists():  # beside the best model only
+            env = VecNormalize.load(str(statistics), test_env.venv)
+        model: Any = ALGOS[self.trial.algo].load(path)
+        return model, evaluate_modes(model, env, self.trial.tests.n_episodes, seed=seed)
+
     def _evaluate(self, test_env: Any, env_kwargs: dict[str, Any]) -> None:
-        seed, n_episodes = self.trial.seed + 1_000, self.trial.tests.n_episodes
+        seed = self.trial.seed + 1_000
         paths = {"final": self.logs / "final_model.zip", "best": self.folder / "model.zip"}
         for name, path in paths.items():
-            statistics, env = path.with_name("vecnormalize.pkl"), test_env
-            if isinstance(test_env, VecNormalize) and statistics.exists():  # beside the best model only
-                env = VecNormalize.load(str(statistics), test_env.venv)
-            tested: Any = ALGOS[self.trial.algo].load(path)
-            found = evaluate_modes(tested, env, n_episodes, seed=seed)
+            tested, found = self._tested(path, test_env, seed)
             found.save(self.folder / ("evaluation.json" if name == "best" else "logs/evaluation_final.json"))
             if name == "best" and isinstance(tested, NoveltyActorCritic):
                 smaller = self.logs / "model_to_act.zip"
