@@ -225,6 +225,8 @@ class ModeReplayBuffer(ExplorationReplayBuffer):
         """
         successes, failures = self.trajectories(success=True), self.trajectories(success=False)
         self._forget_ways()
+        if self.size():
+            self.counted[:] = False  # by the model that is left, not by this one
         nobody = np.full(len(successes), NO_MODE), np.full(len(failures), NO_MODE)
         self.assign_modes(successes, nobody[0], failures, nobody[1], [None] * n_modes)
 

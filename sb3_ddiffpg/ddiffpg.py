@@ -124,8 +124,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     :param explore_off_modes: Whether explorers are paid nothing for places where the trajectories of the modes go that reach
         the goal in half of their episodes, so that another way pays where it leaves the known ones, not only where it ends
     :param explore_past_modes: Whether what lies past such a mode's way is worth anything to an explorer that came along it. If
-        not, its visits there do not count either, nor do earlier ones: what is new by another way stays new. That hinders ways
-        that go on from the end of a known one
+        not, its visits there do not count either (nor earlier ones, with ``"counts"``): what is new by another way stays new.
+        That hinders ways that go on from the end of a known one
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
     :param max_grad_norm: Largest gradient norm of the policy and of each mode's critics
@@ -440,8 +440,9 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         watched = [] if self.explore_past_modes else able
         uncounted = self.replay_buffer.watch_ways({index: self._modes[index].number for index in watched})
         if len(uncounted) and hasattr(self.novelty_model, "forget"):
-            reached = self.replay_buffer.read_observations(uncounted)[1]
-            self.novelty_model.forget(self.replay_buffer.features.of_tensors(reached))
+            for rows in np.array_split(uncounted, -(-len(uncounted) // 50_000)):
+                reached = self.replay_buffer.read_observations(rows)[1]
+                self.novelty_model.forget(self.replay_buffer.features.of_tensors(reached))
         return events
 
     def _row_embeddings(self, batch: ModeBatch, masked: bool) -> th.Tensor:

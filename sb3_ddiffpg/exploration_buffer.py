@@ -46,6 +46,7 @@ class ExplorationReplayBuffer(TrajectoryReplayBuffer):
 
     first_visits: np.ndarray
     followed: np.ndarray
+    counted: np.ndarray
 
     def __init__(
         self,
@@ -72,14 +73,15 @@ class ExplorationReplayBuffer(TrajectoryReplayBuffer):
         self._forget_ways()
 
     def _note_fields(self) -> Fields:
-        return {**super()._note_fields(), "first_visits": ((), bool), "followed": ((), np.int32)}
+        return {**super()._note_fields(), "followed": ((), np.int32), "first_visits": ((), bool), "counted": ((), bool)}
 
     def _view_names(self) -> list[str]:
-        return [*super()._view_names(), "first_visits", "followed"]
+        return [*super()._view_names(), "first_visits", "followed", "counted"]
 
     def _allocate(self) -> None:
         super()._allocate()
         self.first_visits, self.followed = self._notes["first_visits"], self._notes["followed"]
+        self.counted = self._notes["counted"]
 
     def _check_step(self, obs: Any, next_obs: Any, *args: Any) -> None:
         super()._check_step(obs, next_obs, *args)
@@ -92,6 +94,7 @@ class ExplorationReplayBuffer(TrajectoryReplayBuffer):
         if self.known_ways.ways:
             self.known_ways.observe(np.arange(self.n_envs), self._last_positions / self._measured_scale())
         self._last_followed = self.followed[rows] = self.known_ways.followed.copy()
+        self.counted[rows] = self._last_followed == NO_WAY
         if self.visit_cell_size is None:
             self.first_visits[rows] = True
             return
@@ -187,12 +190,13 @@ class ExplorationReplayBuffer(TrajectoryReplayBuffer):
         return noted
 
     def _note_followed(self, ways: Sequence[Way], rows: np.ndarray) -> np.ndarray:
-        """Of one episode; the rows that had come along no way so far."""
+        """Of one episode; the rows whose visits were counted, which from now on they are not."""
         followed = come_along(ways, self._reached(rows))
         came = (followed != NO_WAY) & ~self.past_known_ways(rows)
-        changed = rows[came & (self.followed[rows] == NO_WAY)]
         self.followed[rows[came]] = followed[came]
-        return changed
+        were_counted = rows[came & self.counted[rows]]
+        self.counted[were_counted] = False
+        return were_counted
 
     def _recall_ways(self) -> None:
         envs = np.repeat(np.arange(self.n_envs), self._running_length)

@@ -194,6 +194,7 @@ class TrajectoryReplayBuffer(ReplayBuffer):
             views = {*(id(value) for value in own), *(id(getattr(self, name)) for name in self._view_names())}
             state = {name: value for name, value in state.items() if id(value) not in views}
             state["saved_rows"] = [part.dump(self.pos) for part in self._stored()]
+            state["saved_fields"] = [HostRows(0, fields).dtype.descr for fields in self.part_fields()]
             state["saved_positions"] = [array[: self.pos] for array in self._position_arrays()]
         return state
 
@@ -202,18 +203,19 @@ class TrajectoryReplayBuffer(ReplayBuffer):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         saved_rows, saved_positions = state.pop("saved_rows", None), state.pop("saved_positions", None)
+        saved_fields = state.pop("saved_fields", None)
         self.__dict__.update(state)
         self.storage_device = th.device("cpu")  # another machine may have no other
         if self._allocated:
+            own = [HostRows(0, fields).dtype.descr for fields in self.part_fields()]
+            if saved_fields != own:
+                raise ValueError(f"The replay buffer is of another version: its rows hold {saved_fields}, here {own}")
             self._restore(saved_rows, saved_positions)
 
     def _restore(self, saved_rows: list[np.ndarray], saved_positions: list[np.ndarray]) -> None:
         all_rows = self._all
         self._allocate()
-        for part, fields, records in zip(self._stored(), self.part_fields(), saved_rows, strict=True):
-            size = HostRows(0, fields).dtype.itemsize
-            if records.shape[1] != size:
-                raise ValueError(f"The replay buffer is of another version: rows of {records.shape[1]} bytes, here of {size}")
+        for part, records in zip(self._stored(), saved_rows, strict=True):
             part.restore(records)
         for array, used in zip(self._position_arrays(), saved_positions, strict=True):
             array[: self.pos] = used

@@ -156,6 +156,7 @@ def test_what_came_along_a_way_before_it_was_known(running):
     assert early.known_ways.followed.tolist() == late.known_ways.followed.tolist() == ([5, 5] if running else [NO_WAY] * 2)
     assert len(late.watch_ways({0: 5})) == 0  # not twice
     late.watch_ways({})
+    late.followed[noted] = NO_WAY  # as of a new way
     assert len(late.watch_ways({0: 8})) == 0 and late.past_known_ways(noted).all()  # uncounted before: not once more
 
 

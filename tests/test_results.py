@@ -269,7 +269,18 @@ def test_only_seeds_of_the_same_are_averaged(tmp_path):
         make_report(tmp_path, tmp_path / "out", "x")
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1]", "\0\xff", "algo: ddiffpg", "result: null"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[1]",
+        "\0\xff",
+        "algo: ddiffpg",
+        "result: null",
+        "{algo: ddiffpg, env: x, seed: 0, hyperparams: {}, result: 5}",
+    ],
+)
 def test_a_damaged_record_is_no_training_and_hides_none(tmp_path, text):
     """What lies below it is not taken for others."""
     training(tmp_path, "a", 0, 5)

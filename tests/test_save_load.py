@@ -178,6 +178,16 @@ def test_without_what_only_training_needs(trained, tmp_path):
     assert loaded.actor.optimizer.state
 
 
+def test_targets_are_filled_in_only_from_all_of_what_they_follow():
+    model = small_model(TwoEnds())
+    before = {name: value.clone() for name, value in model.policy.critics_target.state_dict().items()}
+    name = next(iter(before))
+    model.set_parameters({"policy": {f"critics.{name}": before[name] + 1.0}}, exact_match=False)
+    assert th.equal(model.policy.critics.state_dict()[name], before[name] + 1.0)
+    for name, value in model.policy.critics_target.state_dict().items():
+        assert th.equal(value, before[name])
+
+
 def test_zip_size_follows_the_number_of_modes(tmp_path):
     sizes = []
     for n_modes in (0, 8):

@@ -27,7 +27,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     """
     :param folder: Of a training
     :return: All of its record
-    :raises ValueError: If there is none
+    :raises ValueError: If there is none, or it is damaged
     """
     path = folder / _FILE
     if not path.is_file():
@@ -40,6 +40,8 @@ def read_record(folder: Path) -> dict[str, Any]:
     if not isinstance(record, dict) or (missing := {"algo", "env", "seed", "hyperparams"} - set(record)):
         what = "it is no table" if not isinstance(record, dict) else f"it has no {', '.join(sorted(missing))}"
         raise ValueError(f"{path} is not the record of a training: {what}")
+    if not isinstance(record.get("result") or {}, dict):
+        raise ValueError(f"{path} is not the record of a training: its result is no table")
     return record
 
 

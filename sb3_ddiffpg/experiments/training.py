@@ -143,7 +143,7 @@ class _Training:
         model.save(self.logs / "final_model.zip")
         if curve.best_step is None:
             shutil.copy(self.logs / "final_model.zip", self.folder / "model.zip")
-        elif curve.best_step < model.num_timesteps and self._final_is_better(test_env):
+        elif curve.best_step < model.num_timesteps and self._final_is_better(model, test_env):
             result["best_step"] = model.num_timesteps
         self._evaluate(test_env, manager.eval_env_kwargs)
         test_env.close()
@@ -151,8 +151,8 @@ class _Training:
         shutil.rmtree(checkpoints, ignore_errors=True)
         write_progress(self.logs, Progress(model.num_timesteps, manager.n_timesteps, "done"))
 
-    def _final_is_better(self, test_env: Any) -> bool:
-        """Then it takes the place of the model that did best in a test, of few episodes: both are compared in more."""
+    def _final_is_better(self, model: Any, test_env: Any) -> bool:
+        """Or as good. It takes the place of the model that did best in a test, of few episodes: both are compared in more."""
         seed, paths = self.trial.seed + 750, (self.logs / "final_model.zip", self.folder / "model.zip")
         final, best = (score(self._tested(path, test_env, seed)[1]) for path in paths)
         if final < best:
@@ -160,8 +160,8 @@ class _Training:
         unfinished = self.logs / "model.zip"
         shutil.copy(paths[0], unfinished)
         os.replace(unfinished, paths[1])
-        if isinstance(test_env, VecNormalize):
-            test_env.save(str(self.folder / "vecnormalize.pkl"))
+        if (normalizer := model.get_vec_normalize_env()) is not None:
+            normalizer.save(str(self.folder / "vecnormalize.pkl"))
         return True
 
     def _tested(self, path: Path, test_env: Any, seed: int) -> tuple[Any, ModeEvaluation]:
