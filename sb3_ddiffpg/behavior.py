@@ -30,12 +30,15 @@ class Behavior:
     """
 
     def __init__(self, n_envs: int) -> None:
+        self.n_turns = 0
+        self._forget(n_envs)
+
+    def _forget(self, n_envs: int) -> None:
         self.groups = np.zeros(n_envs, dtype=np.int64)
         #: Whether the episode began exploring, has handed over, and may yet
         self.explored = np.zeros(n_envs, dtype=bool)
         self.handed_over = np.zeros(n_envs, dtype=bool)
         self.may_hand_over = np.zeros(n_envs, dtype=bool)
-        self.n_turns = 0
 
     def begin_all(
         self, n_envs: int, n_modes: int, exploration_share: float, explore_then_exploit: float, switch_modes: float = 0.0
@@ -49,8 +52,7 @@ class Behavior:
         :param explore_then_exploit: Probability that an exploring episode may hand over
         :param switch_modes: Probability that one that follows a mode may
         """
-        self.groups = np.zeros(n_envs, dtype=np.int64)
-        self.explored, self.handed_over, self.may_hand_over = (np.zeros(n_envs, dtype=bool) for _ in range(3))
+        self._forget(n_envs)
         for env in range(n_envs):
             self.begin(env, n_modes, exploration_share, explore_then_exploit, switch_modes)
 

@@ -364,16 +364,20 @@ class ModeReplayBuffer(ExplorationReplayBuffer):
             self.followed[rows] = NO_WAY
         self._new_way_rows = np.concatenate([self._new_way_rows[:0], *new_ways])
 
-    def _training(self, mode: int) -> list[Trajectory]:
-        """Goal-reached trajectories that train a mode by its own way."""
-        return [each for each in self.trajectories(success=True) if each.trains and each.mode == mode]
+    def _training(self, modes: Collection[int]) -> dict[int, list[Trajectory]]:
+        """Goal-reached trajectories that train each of these modes by its own way."""
+        members: dict[int, list[Trajectory]] = {mode: [] for mode in modes}
+        for each in self.trajectories(success=True) if members else []:
+            if each.trains and each.mode in members:
+                members[each.mode].append(each)
+        return members
 
     def places_of(self, modes: Collection[int]) -> th.Tensor:
         """
         :param modes: Indices of modes
         :return: Where the goal-reached trajectories go that train one of these by its own way, [N, features.dim]
         """
-        rows = [each.rows for mode in modes for each in self._training(mode)]
+        rows = [each.rows for members in self._training(modes).values() for each in members]
         if not rows:
             return th.empty(0, self.features.dim)
         return self.features.of_tensors(self.read_observations(np.concatenate(rows))[1])
@@ -387,10 +391,12 @@ class ModeReplayBuffer(ExplorationReplayBuffer):
         :return: Rows of the latter, of steps whose visits were counted
         """
         ways = []
-        for mode, number in modes.items():
-            if members := self._training(mode):
+        for mode, members in self._training(modes).items():
+            if members:
                 paths = np.stack([self.path(each) for each in members])
-                ways.append(Way(number, paths, self.route_share * _extent(paths)))
+                ways.append(Way(modes[mode], paths, self.route_share * _extent(paths)))
+        if not ways:
+            return self._watch([])
         # One that is a new way to a goal keeps its worth, however it began
         finished = [*self.trajectories(success=True), *self.trajectories(success=False), *self._retired]
         return self._watch(ways, [each.rows for each in finished if self.way_novelty[each.rows[-1]] == 0])

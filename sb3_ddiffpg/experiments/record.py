@@ -51,7 +51,16 @@ def recorded_trial(folder: Path) -> Trial:
     :return: What was trained
     :raises ValueError: If it is no such folder
     """
-    record = read_record(folder)
+    return trial_of(read_record(folder), folder)
+
+
+def trial_of(record: dict[str, Any], folder: Path) -> Trial:
+    """
+    :param record: Of a training
+    :param folder: Where it lies
+    :return: What was trained
+    :raises ValueError: If that is no trial
+    """
     known = {name: record[name] for name in Trial.__struct_fields__ if name in record}
     try:
         return msgspec.convert({"variant": record["algo"], **known}, Trial)

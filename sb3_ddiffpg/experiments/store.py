@@ -10,7 +10,7 @@ import pandas as pd
 from msgspec.structs import replace
 
 from sb3_ddiffpg.evaluation import ModeEvaluation
-from sb3_ddiffpg.experiments.record import has_record, read_record, recorded_trial
+from sb3_ddiffpg.experiments.record import has_record, read_record, trial_of
 from sb3_ddiffpg.experiments.trial import Trial
 
 
@@ -98,7 +98,7 @@ def _read(folder: Path, record: dict[str, Any]) -> Recorded | None:
 def _of_files(folder: Path, record: dict[str, Any], curve: Path, elsewhere: list[Path]) -> Recorded:
     return Recorded(
         folder,
-        recorded_trial(folder),
+        trial_of(record, folder),
         record,
         pd.read_csv(curve) if curve.is_file() else pd.DataFrame(),
         ModeEvaluation.load(folder / "evaluation.json"),

@@ -143,9 +143,10 @@ class _Training:
         model.save(self.logs / "final_model.zip")
         if curve.best_step is None:
             shutil.copy(self.logs / "final_model.zip", self.folder / "model.zip")
+            result["best_step"] = model.num_timesteps
         elif curve.best_step < model.num_timesteps and self._final_is_better(model, test_env):
             result["best_step"] = model.num_timesteps
-        self._evaluate(test_env, manager.eval_env_kwargs)
+        self._evaluate(test_env, manager.eval_env_kwargs, final_is_best=result["best_step"] == model.num_timesteps)
         test_env.close()
         self._write_record({**result, "complete": True})
         shutil.rmtree(checkpoints, ignore_errors=True)
@@ -172,9 +173,10 @@ class _Training:
         model: Any = ALGOS[self.trial.algo].load(path)
         return model, evaluate_modes(model, env, self.trial.tests.n_episodes, seed=seed)
 
-    def _evaluate(self, test_env: Any, env_kwargs: dict[str, Any]) -> None:
+    def _evaluate(self, test_env: Any, env_kwargs: dict[str, Any], final_is_best: bool) -> None:
         seed = self.trial.seed + 1_000
-        paths = {"final": self.logs / "final_model.zip", "best": self.folder / "model.zip"}
+        paths = {} if final_is_best else {"final": self.logs / "final_model.zip"}
+        paths["best"] = self.folder / "model.zip"
         for name, path in paths.items():
             tested, found = self._tested(path, test_env, seed)
             found.save(self.folder / ("evaluation.json" if name == "best" else "logs/evaluation_final.json"))
