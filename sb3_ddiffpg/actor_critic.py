@@ -638,7 +638,8 @@ class NoveltyActorCritic(SavableAlgorithm):
         return [*super()._excluded_save_params(), "actor", "graphs", "divergence_watch", "_sound_normalization"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        names = ["policy", "actor.optimizer", "policy.critics.optimizer", "novelty_model", "intrinsic_moments"]
-        if self.novelty_model.optimizer is not None:
-            names.append("novelty_model.optimizer")
-        return names, []
+        return ["policy", "actor.optimizer", "policy.critics.optimizer", *self._only_to_train()], []
+
+    def _only_to_train(self) -> list[str]:
+        names = ["novelty_model", "intrinsic_moments"]
+        return names if self.novelty_model.optimizer is None else [*names, "novelty_model.optimizer"]

@@ -349,7 +349,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self.known_places = KnownPlaces(self.replay_buffer.features.dim, self._visit_cell_size()).to(self.device)
+        self.known_places = KnownPlaces(self._visit_cell_size()).to(self.device)
         self.replay_buffer.expect_modes(len(self._modes))
 
     def _create_aliases(self) -> None:
@@ -584,9 +584,8 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
 
     # ------------------------------------------------------------------ saving
 
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        names, variables = super()._get_torch_save_params()
-        return [*names, "known_places"], variables
+    def _only_to_train(self) -> list[str]:
+        return [*super()._only_to_train(), "known_places"]
 
     def state_tree(self) -> dict[str, Any]:
         """

@@ -170,23 +170,45 @@ def _multipliers(dim: int, device: th.device) -> th.Tensor:
     return th.as_tensor(numbers, device=device)
 
 
-class KnownPlaces(nn.Module):
-    """
-    A set of cells, see ``cell_entries``.
+# Of a thousand cells four share their entry with another one
+TABLE_SIZE = 2**18  # 1 MB
 
-    :param dim: Number of coordinates
-    :param cell_size: Edge of a cell, in their unit
+
+class CellTable(nn.Module):
+    """
+    A value for every cell, see ``cell_entries``. It is as large as the one that is loaded into it.
+
+    :param cell_size: Edge of a cell, in the unit of the positions
+    :param name: Of the values
+    :param values: For all cells, shape [table_size]
+    """
+
+    def __init__(self, cell_size: float, name: str, values: th.Tensor) -> None:
+        super().__init__()
+        self.cell_size, self._name = cell_size, name
+        self.register_buffer(name, values)
+
+    def _entries(self, positions: th.Tensor) -> th.Tensor:
+        return cell_entries(positions, self.cell_size, len(getattr(self, self._name)))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        values, stored = getattr(self, self._name), state_dict.get(prefix + self._name)
+        if stored is not None and stored.ndim == 1 and len(stored):
+            setattr(self, self._name, values.new_zeros(len(stored)))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+class KnownPlaces(CellTable):
+    """
+    A set of cells.
+
+    :param cell_size: Edge of a cell, in the unit of the positions
     """
 
     known: th.Tensor
 
-    def __init__(self, dim: int, cell_size: float) -> None:
-        super().__init__()
-        self.cell_size = cell_size
-        self.register_buffer("known", th.zeros(2**16, dtype=th.bool))
-
-    def _entries(self, positions: th.Tensor) -> th.Tensor:
-        return cell_entries(positions, self.cell_size, len(self.known))
+    def __init__(self, cell_size: float) -> None:
+        super().__init__(cell_size, "known", th.zeros(TABLE_SIZE, dtype=th.bool))
 
     def replace(self, positions: th.Tensor) -> None:
         """
@@ -203,9 +225,9 @@ class KnownPlaces(nn.Module):
         return self.known[self._entries(positions)]
 
 
-class VisitCounts(nn.Module):
+class VisitCounts(CellTable):
     """
-    Novelty as ``1 / sqrt(1 + n)``, n the visits of the position's cell (Bellemare et al., 2016), see ``cell_entries``.
+    Novelty as ``1 / sqrt(1 + n)``, n the visits of the position's cell (Bellemare et al., 2016).
 
     :param position_dim: Size of the position features
     :param observation_dim: Not used: counting needs few dimensions
@@ -217,19 +239,14 @@ class VisitCounts(nn.Module):
     counts: th.Tensor
 
     def __init__(
-        self, position_dim: int, observation_dim: int, cell_size: float = default_cell_size, table_size: int = 2**16
+        self, position_dim: int, observation_dim: int, cell_size: float = default_cell_size, table_size: int = TABLE_SIZE
     ) -> None:
-        super().__init__()
         if cell_size <= 0:
             raise ValueError(f"novelty_kwargs['cell_size'] must be positive, got {cell_size}")
         if table_size < 1:
             raise ValueError(f"novelty_kwargs['table_size'] must be at least 1, got {table_size}")
-        self.cell_size = cell_size
-        self.register_buffer("counts", th.zeros(table_size))
+        super().__init__(cell_size, "counts", th.zeros(table_size))
         self.optimizer: th.optim.Optimizer | None = None
-
-    def _entries(self, positions: th.Tensor) -> th.Tensor:
-        return cell_entries(positions, self.cell_size, len(self.counts))
 
     @th.no_grad()
     def observe(self, positions: th.Tensor) -> None:

@@ -38,7 +38,7 @@ class SavableAlgorithm(OffPolicyAlgorithm):
     run_id: str
     #: Networks of the policy that follow others slowly and only train: what they follow, by name
     target_networks: ClassVar[dict[str, str]] = {}
-    _leaves_out_targets = False
+    _saves_to_act = False
     #: Attributes that are plain values, and their types
     _counters: ClassVar[dict[str, Any]] = {
         "num_timesteps": int,
@@ -88,34 +88,43 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         :param path: Path to the file
         :param exclude: Attributes to leave out
         :param include: Attributes to save though they are usually left out
-        :param to_train: Whether what only training needs is saved: what the optimisers have gathered, and target networks.
-            Without it the file is a third to three quarters as large, and training that goes on from it begins with fresh ones
+        :param to_train: Whether what only training needs is saved: what the optimisers have gathered, target networks, and
+            what is known of where it has been. Without it the file is a third as large or less, and training that goes on
+            from it begins with fresh ones
         """
         attributes = (recursive_getattr(self, name) for name in self._get_torch_save_params()[0])
         left_out = [each for each in attributes if isinstance(each, th.optim.Optimizer) and not to_train]
         states = [optimizer.state for optimizer in left_out]
         try:
-            self._leaves_out_targets = not to_train
+            self._saves_to_act = not to_train
             for optimizer in left_out:
                 optimizer.state = defaultdict(dict)
             super().save(path, exclude, include)
         finally:
-            self._leaves_out_targets = False
+            self._saves_to_act = False
             for optimizer, state in zip(left_out, states, strict=True):
                 optimizer.state = state
 
     def get_parameters(self) -> dict[str, dict]:
         """See SB3."""
         parameters = super().get_parameters()
-        if self._leaves_out_targets:
+        if self._saves_to_act:
             targets = tuple(f"{name}." for name in self.target_networks)
             parameters["policy"] = {name: each for name, each in parameters["policy"].items() if not name.startswith(targets)}
+            parameters = {name: each for name, each in parameters.items() if name not in self._only_to_train()}
         return parameters
+
+    def _only_to_train(self) -> list[str]:
+        """Those of the saved parts without which the model acts as before, but for optimisers."""
+        return []
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
-        """See SB3. A target network of which nothing is given begins as a copy of what it follows, if all of that is given."""
+        """
+        See SB3. A target network of which nothing is given begins as a copy of what it follows, if all of that is given; and
+        what only training needs stays as it is where all of it is left out.
+        """
         parameters: Any = load_path_or_dict
         if not isinstance(parameters, dict):
             _, parameters, _ = load_from_zip_file(parameters, device=device, load_data=False)
@@ -126,7 +135,12 @@ class SavableAlgorithm(OffPolicyAlgorithm):
             if set(followed) <= set(policy) and not any(name.startswith(f"{target}.") for name in policy):
                 copies = {f"{target}{name[len(online) :]}": policy[name] for name in followed}
                 policy = {**policy, **copies}
-        self._set_parameters({**parameters, **({"policy": policy} if policy else {})}, exact_match, device)
+        parameters = {**parameters, **({"policy": policy} if policy else {})}
+        left_out = self._only_to_train()
+        if policy and not set(left_out) & set(parameters):
+            current = self.get_parameters()
+            parameters.update({name: current[name] for name in left_out})
+        self._set_parameters(parameters, exact_match, device)
 
     def _set_parameters(self, parameters: Any, exact_match: bool, device: th.device | str) -> None:
         super().set_parameters(parameters, exact_match, device)
@@ -249,4 +263,4 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         """
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_interrupted", "_leaves_out_targets"]
+        return [*super()._excluded_save_params(), "_interrupted", "_saves_to_act"]

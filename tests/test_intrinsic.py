@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import DDiffPG
-from sb3_ddiffpg.intrinsic import RandomNetworkDistillation, RunningMoments, VisitCounts, noveld_reward
+from sb3_ddiffpg.intrinsic import KnownPlaces, RandomNetworkDistillation, RunningMoments, VisitCounts, noveld_reward
 from sb3_ddiffpg.modes import Outcome
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
 
@@ -91,6 +91,19 @@ def test_visit_counts_tell_the_cells_of_a_maze_apart():
     # The same cell has the same entry in every process
     other = VisitCounts(2, 0)
     assert other._entries(th.tensor([[0.6, -3.2]])).tolist() == counts._entries(th.tensor([[0.9, -3.4]])).tolist()
+
+
+def test_tables_are_as_large_as_what_is_loaded_into_them():
+    """Of a model that was made with another default."""
+    saved, loaded, here = VisitCounts(2, 0, table_size=64), VisitCounts(2, 0), th.tensor([[0.1, 0.2]])
+    saved.observe(here)
+    loaded.load_state_dict(saved.state_dict())
+    assert loaded.novelty(here, here) == saved.novelty(here, here) == 0.5**0.5
+    places, known = KnownPlaces(0.5), KnownPlaces(0.5)
+    places.known = places.known[:64].clone()
+    places.replace(here)
+    known.load_state_dict(places.state_dict())
+    assert known.contain(here) and known.known.sum() == 1
 
 
 def test_visit_counts_have_nothing_to_learn():
