@@ -8,11 +8,9 @@ import base64
 import inspect
 import io
 import json
-import platform
 import re
 import shlex
 from dataclasses import dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +26,8 @@ from sb3_ddiffpg import pictures, plots
 from sb3_ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
+from sb3_ddiffpg.experiments.machine import versions
 
-_PACKAGES = ("sb3_ddiffpg", "stable-baselines3", "torch", "gymnasium", "mujoco", "numpy")
 # Of an evaluation's episodes, so many are drawn for each mode
 _ROUTES_DRAWN = 20
 
@@ -189,7 +187,7 @@ def make_report(
         history=str(model.mode_history),
         settings=_settings(model),
         reproduce=command,
-        versions=_versions(),
+        versions=", ".join(f"{name} {number}" for name, number in versions().items()),
     )
     output.write_text(page, encoding="utf-8")
     return found
@@ -292,16 +290,6 @@ def _command(given: argparse.Namespace, task: Task) -> str:
         words += [] if value is None else [option, str(value)]
     words += ["--episodes", str(given.episodes), "--seed", str(given.seed), *(["--no-videos"] if given.no_videos else [])]
     return shlex.join(words)
-
-
-def _versions() -> str:
-    known = []
-    for name in _PACKAGES:
-        try:
-            known.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            continue
-    return ", ".join([*known, f"Python {platform.python_version()}"])
 
 
 def _keyword(text: str) -> tuple[str, Any]:
