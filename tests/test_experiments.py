@@ -5,14 +5,18 @@ import re
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch as th
 import yaml
+from environments import TwoEnds
 from filelock import FileLock
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.callbacks import EvaluateModesCallback
 from sb3_ddiffpg.evaluation import ModeEvaluation
 from sb3_ddiffpg.experiments import __main__ as cli
 from sb3_ddiffpg.experiments.curve import Clock, CurveCallback
@@ -111,6 +115,31 @@ def test_a_run_that_was_killed_goes_on(monkeypatch, tmp_path):
     record(monkeypatch, tmp_path / "b", *command)
     assert (tmp_path / "b" / "model.zip").stat().st_mtime_ns == before
     assert sorted(path.name for path in (tmp_path / "b" / "logs").glob("*.monitor.csv")) == ["0.monitor.csv", "1.monitor.csv"]
+
+
+def test_a_way_that_is_not_listed_has_a_column_from_the_test_on_that_takes_it(monkeypatch, tmp_path):
+    def tested(step, **labels):
+        return step, SimpleNamespace(
+            label_source="environment",
+            listed=("a",),
+            commanded=(),
+            uncommanded=SimpleNamespace(n_episodes=4, labels=labels, success_rate=1.0),
+            commanded_modes=1.0,
+            robust_modes=1,
+            expected_modes=lambda: 1.0,
+        )
+
+    tests = iter([tested(1, a=4), tested(2, a=1, b=2), tested(3, a=4)])
+    monkeypatch.setattr(EvaluateModesCallback, "_on_period", lambda self: self.evaluations.append(next(tests)))
+    (tmp_path / "logs").mkdir()
+    curve = CurveCallback(tmp_path, eval_env=DummyVecEnv([TwoEnds]), eval_freq=1)
+    curve.model = SimpleNamespace(_n_updates=0, modes=[])
+    for _ in range(3):
+        curve._on_period()
+        curve.reached.update("ab")
+    with (tmp_path / "curve.csv").open() as file:
+        rows = [[row[name] for name in ("step", "a", "reached a", "b", "reached b")] for row in csv.DictReader(file)]
+    assert rows == [["1", "1.0", "0", "", ""], ["2", "0.25", "1", "0.5", "1"], ["3", "1.0", "2", "0.0", "2"]]
 
 
 def test_settings_that_do_not_exist(monkeypatch, tmp_path, capsys):

@@ -15,6 +15,8 @@ from sb3_ddiffpg.episodes import run_episodes
 RESULTS = Path(__file__).parents[2] / "results"
 N_EPISODES = 20
 ANT, ARM = "AntMaze", "Franka"
+REACHED = "reached "
+LEAST_SUCCESS = 0.5
 
 
 def recorded(env_id: str) -> list[Path]:
@@ -25,17 +27,19 @@ def recorded(env_id: str) -> list[Path]:
     return sorted((RESULTS / env_id).glob("seed*"))
 
 
-def draw_curves(steps: Axes, hours: Axes, runs: list[Path], ways: tuple[str, ...]) -> None:
+def draw_curves(steps: Axes, hours: Axes, runs: list[Path]) -> None:
     """
-    :param steps: Gets the success of each way against environment steps
+    :param steps: Gets the success against environment steps of each way that a command has taken in half of a test
     :param hours: The same against hours
     :param runs: Folders of recorded runs
-    :param ways: Those of the environment
     """
     curves = [pd.read_csv(run / "curve.csv") for run in runs]
-    taken = [way for way in ways if any(curve[way].any() for curve in curves)]
+    ways = sorted({name.removeprefix(REACHED) for curve in curves for name in curve if name.startswith(REACHED)})
+    commanded = [way for way in ways if any(way in curve and (curve[way] >= LEAST_SUCCESS).any() for curve in curves)]
     for number, (run, curve) in enumerate(zip(runs, curves, strict=True)):
-        for color, way in enumerate(taken):
+        for color, way in enumerate(commanded):
+            if way not in curve:
+                continue
             style = {"color": f"C{color}", "ls": ["-", "--", ":"][number % 3], "label": f"{way}, {run.name}"}
             steps.plot(curve["step"], curve[way], **style)
             hours.plot(curve["hours"], curve[way], **style)
@@ -54,7 +58,7 @@ def draw_ant(env_id: str) -> Figure:
     steps, hours, routes = figure.subplots(1, 3, width_ratios=(3, 3, 3.4))
     runs = recorded(env_id)
     env = make_vec_env(env_id, N_EPISODES, seed=0, start_noise=0.0, integrator="euler")
-    draw_curves(steps, hours, runs, env.get_attr("listed_modes")[0])
+    draw_curves(steps, hours, runs)
     model = DDiffPG.load(runs[0] / "model.zip")
     model.set_random_seed(0)
     episodes = {name: run_episodes(model, env, N_EPISODES, mode=name) for name in model.modes.names}
@@ -71,9 +75,7 @@ def draw_arm(env_ids: list[str]) -> Figure:
     """
     figure = Figure(figsize=(9.5, 3.2 * len(env_ids)), layout="constrained")
     for env_id, (steps, hours) in zip(env_ids, np.atleast_2d(figure.subplots(len(env_ids), 2)), strict=True):
-        env = make_vec_env(env_id, 1)
-        draw_curves(steps, hours, recorded(env_id), env.get_attr("listed_modes")[0])
-        env.close()
+        draw_curves(steps, hours, recorded(env_id))
         steps.set_title(env_id)
     return figure
 

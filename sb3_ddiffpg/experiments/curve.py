@@ -11,9 +11,13 @@ from typing import Any
 import psutil
 
 from sb3_ddiffpg.callbacks import EvaluateModesCallback
+from sb3_ddiffpg.evaluation import ModeEvaluation
 from sb3_ddiffpg.experiments.wall_clock import Stopwatch
 from sb3_ddiffpg.safe_files import convert
 from sb3_ddiffpg.trajectories import read_success
+
+# Column of the goals reached in training by a way
+_REACHED = "reached "
 
 
 class Clock:
@@ -88,15 +92,22 @@ class CurveCallback(EvaluateModesCallback):
             "robust_modes": found.robust_modes,
             "success_rate": round(found.uncommanded.success_rate, 3),
         }
-        for label in found.listed:
+        for label in self._labels(found):
             shares = [each.labels.get(label, 0) / each.n_episodes for each in (*found.commanded, found.uncommanded)]
             row[label] = round(max(shares), 3)
-            row[f"reached {label}"] = self.reached[label]
+            row[_REACHED + label] = self.reached[label]
         self.rows.append(row)
         with (self.folder / "curve.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(row))
+            writer = csv.DictWriter(file, list(row), restval="")
             writer.writeheader()
             writer.writerows(self.rows)
+
+    def _labels(self, found: ModeEvaluation) -> list[str]:
+        """Of the ways that are listed, and of those that a test has taken, this one or one before."""
+        before = [name.removeprefix(_REACHED) for name in (self.rows or [{}])[-1] if name.startswith(_REACHED)]
+        told = found.label_source == "environment"  # those of a clustering mean something else in each test
+        taken = sorted({label for each in (*found.commanded, found.uncommanded) for label in each.labels}) if told else []
+        return list(dict.fromkeys([*found.listed, *before, *taken]))
 
     def state_dict(self) -> dict[str, Any]:
         """
