@@ -113,6 +113,21 @@ def test_curves_pass_through_the_tests(tmp_path):
     assert band.get_paths()[0].vertices[:, 1].max() == pytest.approx(1.0)
 
 
+def test_each_of_many_variants_has_a_panel(tmp_path):
+    """Thirteen lines in one panel cannot be told apart; the unchanged algorithm comes first."""
+    for number in range(13):
+        training(tmp_path, f"a{number:02}", 0, number)
+    training(tmp_path, "td3_c51", 0, 20)
+    figure = figures.curves(store.read_results(tmp_path)[0], "success_rate")
+    panels = [axes for axes in figure.axes if axes.get_title()]
+    assert [axes.get_title().split()[0] for axes in panels] == ["td3_c51", *(f"a{number:02}" for number in range(13))]
+    # Behind it are all means, in front its own
+    for axes, n_successes in zip(panels, [20, *range(13)], strict=True):
+        *behind, own = axes.lines
+        assert len(behind) == 14 and own.get_ydata()[-1] == pytest.approx(n_successes / 20)
+        assert sorted(line.get_ydata()[-1] for line in behind) == pytest.approx([n / 20 for n in [*range(13), 20]])
+
+
 def test_a_report_of_everything(tmp_path):
     for value in (1, 4):
         for seed in (0, 1):

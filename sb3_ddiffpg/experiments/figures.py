@@ -19,6 +19,8 @@ from sb3_ddiffpg.zoo import ALGOS
 
 # Places on the horizontal axis, to which every training's tests are interpolated
 _N_PLACES = 60
+# More lines than this in one panel cannot be told apart: each variant has a panel of its own then
+_MOST_LINES = 12
 _LABELS = {
     "success_rate": "success, uncommanded",
     "expected_modes": "modes expected in 20 episodes",
@@ -38,25 +40,36 @@ def palette(runs: Sequence[Recorded]) -> dict[str, Any]:
 
 def curves(runs: Sequence[Recorded], measure: str, against: str = "step") -> Figure:
     """
-    A measure along training, for each task: the mean over seeds, between the lowest and the highest.
+    A measure along training, for each task: the mean over seeds, between the lowest and the highest. Many variants have a
+    panel each, with the others' means behind.
 
     :param runs: Trainings
     :param measure: Column of their curves, such as ``"success_rate"``
     :param against: ``"step"`` or ``"hours"``
     :return: The figure
     """
-    tasks = by(task_of, [run for run in runs if measure in run.curve and run.curve[measure].notna().any()])
-    figure, panels = _panels(len(tasks))
+    known = [run for run in runs if measure in run.curve and run.curve[measure].notna().any()]
     colors = palette(runs)
-    for axes, (task, own) in zip(panels, tasks.items(), strict=True):
-        data = pd.concat([_interpolated(each, measure, against) for each in by(variant_of, own).values()], ignore_index=True)
-        sns.lineplot(data, x=against, y=measure, hue="variant", palette=colors, ax=axes, errorbar=("pi", 100))
-        axes.set(title=task, xlabel={"step": "environment steps"}.get(against, against), ylabel=_LABELS.get(measure, measure))
+    tables = {
+        task: pd.concat([_interpolated(each, measure, against) for each in by(variant_of, own).values()], ignore_index=True)
+        for task, own in by(task_of, known).items()
+    }
+    apart = len(colors) > _MOST_LINES
+    shown = [(task, variant) for task, table in tables.items() for variant in (table["variant"].unique() if apart else [None])]
+    figure, panels = _panels(len(shown))
+    for axes, (task, variant) in zip(panels, shown, strict=True):
+        data, title = tables[task], task
+        if variant is not None:
+            means = data.groupby(["variant", against])[measure].mean().unstack(0)
+            axes.plot(means.index, means, color="0.85", linewidth=0.8)
+            data, title = data[data["variant"] == variant], f"{variant}\n{task}"
+        sns.lineplot(data, x=against, y=measure, hue="variant", palette=colors, ax=axes, errorbar=("pi", 100), legend=False)
+        axes.set(title=title, xlabel={"step": "environment steps"}.get(against, against), ylabel=_LABELS.get(measure, measure))
         axes.set_ylim(0, 1.03 if measure == "success_rate" else None)
         if against == "step":
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.get_legend().remove()
-    _one_legend(figure, panels, colors)
+    if not apart:
+        _one_legend(figure, panels, colors)
     return figure
 
 
@@ -212,4 +225,7 @@ def _one_legend(figure: Figure, panels: Sequence[Any], colors: dict[str, Any]) -
     if not panels:
         return
     handles = [panels[0].plot([], [], color=color)[0] for color in colors.values()]
-    figure.legend(handles, list(colors), loc="outside lower center", ncols=min(4, len(colors)))
+    width, height = figure.get_size_inches()
+    n_columns = max(1, min(len(colors), int(width / (0.9 + 0.09 * max(map(len, colors))))))
+    figure.set_size_inches(width, height + 0.22 * -(-len(colors) // n_columns))
+    figure.legend(handles, list(colors), loc="outside lower center", ncols=n_columns)

@@ -43,7 +43,7 @@ class Recorded:
 def read_results(folder: Path) -> tuple[list[Recorded], list[Path]]:
     """
     :param folder: In which trainings have left their records, at whatever depth
-    :return: The complete ones, and the folders of the others
+    :return: The complete ones, unchanged algorithms first, and the folders of the others
     :raises ValueError: If there is none at all
     """
     complete, others = [], []
@@ -60,6 +60,7 @@ def read_results(folder: Path) -> tuple[list[Recorded], list[Path]]:
             complete.append(recorded)
     if not complete and not others:
         raise ValueError(f"results: {folder} given; accepted is a folder in which trainings have left their records")
+    complete.sort(key=lambda run: run.trial.variant != run.trial.algo)
     return complete, others
 
 
