@@ -494,6 +494,9 @@ class NoveltyActorCritic(SavableAlgorithm):
         return self.policy.predict(self._last_obs)[0]  # type: ignore[arg-type]
 
     def _store_transition(self, replay_buffer: ModeReplayBuffer, *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
+        if self._vec_normalize_env is not None:
+            # By its statistics one broken environment breaks what the others' episodes ended with
+            replay_buffer.check_finite("next observation", self._vec_normalize_env.get_original_obs())
         super()._store_transition(replay_buffer, *args, **kwargs)
         if len(counted := replay_buffer.counted_positions()):
             self.novelty_model.observe(th.as_tensor(counted, device=self.device))

@@ -2,6 +2,7 @@
 
 import warnings
 from copy import deepcopy
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -324,6 +325,16 @@ def test_what_is_refused_behind_a_normalising_wrapper(part, when, normalized, va
     # The wrapper had taken it in. Its statistics are those of the last rollout again, and training goes on
     np.testing.assert_equal(normalization(env), noted[-1])
     model.learn(60, reset_num_timesteps=False)
+
+
+def test_the_broken_one_is_named_though_all_episodes_end_at_once():
+    """VecNormalize has taken NaN into its statistics when it scales what the other environments' episodes ended with."""
+    envs = [partial(BreaksAt, TwoEnds(limit=1), "reset", 4 if number == 1 else 10**9) for number in range(3)]
+    model = small_model(VecNormalize(DummyVecEnv(envs), norm_reward=False))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numpy's, of NaN
+        with pytest.raises(ValueError, match="next observation of environment 1 is not finite"):
+            model.learn(100)
 
 
 def test_infinite_values_stop_it_too():

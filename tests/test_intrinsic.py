@@ -152,7 +152,7 @@ def test_distillation_error_is_the_distance_of_the_networks():
 def filled_model(**changes):
     """Two environments, some modes, and more in the buffer than there are visits to any place."""
     model = small_model(DummyVecEnv([TwoEnds] * 4), **({"explore_off_modes": False} | changes))
-    model.learn(160)
+    model.learn(240)
     assert len(model.modes) >= 1
     return model
 
@@ -228,7 +228,8 @@ def test_rewards_of_a_batch(novelty, mode_intrinsic_coef, exploration_gamma):
         gamma = model.gamma if group else exploration_gamma
         intrinsic = slow_intrinsic_reward(model, batch.windows[group, column], gamma=gamma)
         if group == 0:
-            expected[group, column] = intrinsic  # the environment's reward plays no part in exploration
+            # The environment's reward counts only where a goal was reached by a way that is new
+            expected[group, column] = intrinsic + 2.0 * batch.new_ways[column].item()
         else:
             expected[group, column] += mode_intrinsic_coef * intrinsic
     np.testing.assert_allclose(model._rewards(batch, defaultdict(list)).cpu(), expected, rtol=1e-4, atol=1e-6)
