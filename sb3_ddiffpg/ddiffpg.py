@@ -211,7 +211,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         novelty_scale: float = 0.5,
         intrinsic_coef: float = 0.05,
         mode_intrinsic_coef: float = 0.0,
-        new_way_coef: float = 1.0,
+        new_way_coef: float = 0.0,
         normalize_intrinsic: bool = True,
         intrinsic_clip: float = 10.0,
         episodic_novelty: bool = True,

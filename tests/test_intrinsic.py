@@ -210,12 +210,19 @@ def slow_intrinsic_reward(model, window, scale=1.0, ordinary=0.0, gamma=None):
 
 
 @pytest.mark.parametrize(
-    ("novelty", "mode_intrinsic_coef", "exploration_gamma"),
-    [("rnd", 0.0, None), ("counts", 0.0, None), ("rnd", 0.5, None), ("counts", 0.5, None), ("counts", 0.5, 0.7)],
+    ("novelty", "mode_intrinsic_coef", "exploration_gamma", "new_way_coef"),
+    [
+        ("rnd", 0.0, None, 0.0),
+        ("counts", 0.0, None, 1.5),
+        ("rnd", 0.5, None, 1.0),
+        ("counts", 0.5, None, 0.0),
+        ("counts", 0.5, 0.7, 1.0),
+    ],
 )
-def test_rewards_of_a_batch(novelty, mode_intrinsic_coef, exploration_gamma):
+def test_rewards_of_a_batch(novelty, mode_intrinsic_coef, exploration_gamma, new_way_coef):
     model = filled_model(
         novelty=novelty,
+        new_way_coef=new_way_coef,
         mode_intrinsic_coef=mode_intrinsic_coef,
         exploration_gamma=exploration_gamma,
         normalize_intrinsic=False,
@@ -229,7 +236,7 @@ def test_rewards_of_a_batch(novelty, mode_intrinsic_coef, exploration_gamma):
         intrinsic = slow_intrinsic_reward(model, batch.windows[group, column], gamma=gamma)
         if group == 0:
             # The environment's reward counts only where a goal was reached by a way that is new
-            expected[group, column] = intrinsic + 2.0 * batch.new_ways[column].item()
+            expected[group, column] = intrinsic + new_way_coef * 2.0 * batch.new_ways[column].item()
         else:
             expected[group, column] += mode_intrinsic_coef * intrinsic
     np.testing.assert_allclose(model._rewards(batch, defaultdict(list)).cpu(), expected, rtol=1e-4, atol=1e-6)
