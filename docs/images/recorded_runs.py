@@ -11,11 +11,11 @@ from matplotlib.ticker import EngFormatter
 from sb3_ddiffpg import DDiffPG, plots
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.episodes import run_episodes
+from sb3_ddiffpg.experiments.curve import REACHED
 
 RESULTS = Path(__file__).parents[2] / "results"
 N_EPISODES = 20
 ANT, ARM = "AntMaze", "Franka"
-REACHED = "reached "
 LEAST_SUCCESS = 0.5
 
 

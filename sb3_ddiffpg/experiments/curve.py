@@ -16,8 +16,8 @@ from sb3_ddiffpg.experiments.wall_clock import Stopwatch
 from sb3_ddiffpg.safe_files import convert
 from sb3_ddiffpg.trajectories import read_success
 
-# Column of the goals reached in training by a way
-_REACHED = "reached "
+#: Column of the goals reached in training by a way, before its label
+REACHED = "reached "
 
 
 class Clock:
@@ -95,7 +95,7 @@ class CurveCallback(EvaluateModesCallback):
         for label in self._labels(found):
             shares = [each.labels.get(label, 0) / each.n_episodes for each in (*found.commanded, found.uncommanded)]
             row[label] = round(max(shares), 3)
-            row[_REACHED + label] = self.reached[label]
+            row[REACHED + label] = self.reached[label]
         self.rows.append(row)
         with (self.folder / "curve.csv").open("w", newline="") as file:
             writer = csv.DictWriter(file, list(row), restval="")
@@ -104,7 +104,7 @@ class CurveCallback(EvaluateModesCallback):
 
     def _labels(self, found: ModeEvaluation) -> list[str]:
         """Of the ways that are listed, and of those that a test has taken, this one or one before."""
-        before = [name.removeprefix(_REACHED) for name in (self.rows or [{}])[-1] if name.startswith(_REACHED)]
+        before = [name.removeprefix(REACHED) for name in (self.rows or [{}])[-1] if name.startswith(REACHED)]
         told = found.label_source == "environment"  # those of a clustering mean something else in each test
         taken = sorted({label for each in (*found.commanded, found.uncommanded) for label in each.labels}) if told else []
         return list(dict.fromkeys([*found.listed, *before, *taken]))

@@ -50,19 +50,19 @@ def curves(runs: Sequence[Recorded], measure: str, against: str = "step") -> Fig
     """
     known = [run for run in runs if measure in run.curve and run.curve[measure].notna().any()]
     colors = palette(runs)
-    tables = {
-        task: pd.concat([_interpolated(each, measure, against) for each in by(variant_of, own).values()], ignore_index=True)
-        for task, own in by(task_of, known).items()
-    }
     apart = len(colors) > _MOST_LINES
-    shown = [(task, variant) for task, table in tables.items() for variant in (table["variant"].unique() if apart else [None])]
+    shown: list[tuple[str, pd.DataFrame, pd.DataFrame | None]] = []
+    for task, own in by(task_of, known).items():
+        table = pd.concat([_interpolated(each, measure, against) for each in by(variant_of, own).values()], ignore_index=True)
+        if apart:
+            means = table.groupby(["variant", against])[measure].mean().unstack(0)
+            shown += [(f"{variant}\n{task}", data, means) for variant, data in table.groupby("variant", sort=False)]
+        else:
+            shown.append((task, table, None))
     figure, panels = _panels(len(shown))
-    for axes, (task, variant) in zip(panels, shown, strict=True):
-        data, title = tables[task], task
-        if variant is not None:
-            means = data.groupby(["variant", against])[measure].mean().unstack(0)
-            axes.plot(means.index, means, color="0.85", linewidth=0.8)
-            data, title = data[data["variant"] == variant], f"{variant}\n{task}"
+    for axes, (title, data, behind) in zip(panels, shown, strict=True):
+        if behind is not None:
+            axes.plot(behind.index, behind, color="0.85", linewidth=0.8)
         sns.lineplot(data, x=against, y=measure, hue="variant", palette=colors, ax=axes, errorbar=("pi", 100), legend=False)
         axes.set(title=title, xlabel={"step": "environment steps"}.get(against, against), ylabel=_LABELS.get(measure, measure))
         axes.set_ylim(0, 1.03 if measure == "success_rate" else None)
