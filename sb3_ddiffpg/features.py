@@ -18,23 +18,23 @@ LARGEST_USEFUL_BOUND = 1e4
 
 class ScaledFlattenExtractor(BaseFeaturesExtractor):
     """
-    Flattens the observation and maps every component with declared finite bounds to ``[-half_width, half_width]``; others pass
-    unchanged. So what the networks see does not depend on the unit; the wider the interval, the better they tell places apart.
+    Flattens the observation. If told to, maps every component with declared finite bounds to ``[-half_width, half_width]``, so
+    that what the networks see does not depend on the unit; but in a narrow interval they tell places apart less well.
 
     :param observation_space: Any space but a dict
-    :param half_width: Where the bounds come to lie
+    :param half_width: Where the bounds come to lie; None leaves all components as they are
     :raises ValueError: If it is not positive
     """
 
     offset: th.Tensor
     scale: th.Tensor
 
-    def __init__(self, observation_space: spaces.Space, half_width: float = 1.0) -> None:
-        if not (isinstance(half_width, int | float) and 0 < half_width < np.inf):
-            raise ValueError(f"features_extractor_kwargs['half_width'] must be positive and finite, got {half_width!r}")
+    def __init__(self, observation_space: spaces.Space, half_width: float | None = None) -> None:
+        if half_width is not None and not (isinstance(half_width, int | float) and 0 < half_width < np.inf):
+            raise ValueError(f"features_extractor_kwargs['half_width'] must be positive, finite or None, got {half_width!r}")
         super().__init__(observation_space, get_flattened_obs_dim(observation_space))
         offset, scale = np.zeros(self.features_dim), np.ones(self.features_dim)
-        if isinstance(observation_space, spaces.Box) and not is_image_space(observation_space):
+        if half_width is not None and isinstance(observation_space, spaces.Box) and not is_image_space(observation_space):
             low, high = observation_space.low.ravel().astype(np.float64), observation_space.high.ravel().astype(np.float64)
             bounded = (np.abs(low) < LARGEST_USEFUL_BOUND) & (np.abs(high) < LARGEST_USEFUL_BOUND) & (low < high)
             offset[bounded] = (low[bounded] + high[bounded]) / 2
