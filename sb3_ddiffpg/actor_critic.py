@@ -398,7 +398,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         return th.from_numpy(first).to(self.device, non_blocking=True)
 
     def _novelty_inputs(self, obs: Any) -> tuple[th.Tensor, th.Tensor]:
-        """Positions [N, position_dim] and scaled features [N, features_dim] of observations, not normalised, on the device."""
+        """Positions [N, position_dim] and features [N, features_dim] of observations, not normalised, on the device."""
         positions = self.replay_buffer.features.of_tensors(obs)
         if not getattr(self.novelty_model, "with_observation", False):
             return positions, positions

@@ -21,16 +21,11 @@ def test_bounds_come_to_lie_where_they_are_told(low, width, half_width, share):
     assert seen[0, 1].item() == np.float32(low)
 
 
-def test_observations_are_seen_as_they_are_unless_told_otherwise():
-    model = small_model(TwoEnds())
-    for extractor in (model.actor.features_extractor, model.policy.critic_features_extractor):
-        np.testing.assert_array_equal(extractor(th.tensor([[2.0, -1.5]])), [[2.0, -1.5]])
-
-
 def test_a_model_is_told_by_its_policys_arguments():
-    model = small_model(TwoEnds(), policy_kwargs={"net_arch": [16], "features_extractor_kwargs": {"half_width": 8}})
-    for extractor in (model.actor.features_extractor, model.policy.critic_features_extractor):
-        np.testing.assert_allclose(extractor(th.tensor([[2.0, -1.0]])), [[8.0, -4.0]])  # TwoEnds' bounds are -2 and 2
+    for kwargs, seen in (({}, [3.0, -1.5]), ({"half_width": 8}, [8.0, -4.0]), ({"half_width": None}, [2.0, -1.0])):
+        model = small_model(TwoEnds(), policy_kwargs={"net_arch": [16], "features_extractor_kwargs": kwargs})
+        for extractor in (model.actor.features_extractor, model.policy.critic_features_extractor):
+            np.testing.assert_allclose(extractor(th.tensor([[2.0, -1.0]])), [seen])  # TwoEnds' bounds are -2 and 2
     for wrong in (0.0, -1.0, np.inf, np.nan, "wide"):
         with pytest.raises(ValueError, match=r"features_extractor_kwargs\['half_width'\] must be positive"):
             small_model(TwoEnds(), policy_kwargs={"features_extractor_kwargs": {"half_width": wrong}})
