@@ -18,9 +18,9 @@ LARGEST_USEFUL_BOUND = 1e4
 
 class ScaledFlattenExtractor(BaseFeaturesExtractor):
     """
-    Flattens the observation and maps every component with declared finite bounds to ``[-half_width, half_width]``; others pass
-    unchanged. So what the networks see does not depend on the unit. In a narrow interval they tell places apart less well; in a
-    wide one, what critics learn at one place says little about the next, and explorers do not find on.
+    Flattens the observation. If told to, maps every component with declared finite bounds to ``[-half_width, half_width]``, so
+    that what the networks see does not depend on the unit. In a narrow interval they tell places apart less well; in a wide
+    one, what critics learn at one place says little about the next, and explorers may stop.
 
     :param observation_space: Any space but a dict
     :param half_width: Where the bounds come to lie; None leaves all components as they are
@@ -30,7 +30,7 @@ class ScaledFlattenExtractor(BaseFeaturesExtractor):
     offset: th.Tensor
     scale: th.Tensor
 
-    def __init__(self, observation_space: spaces.Space, half_width: float | None = 3.0) -> None:
+    def __init__(self, observation_space: spaces.Space, half_width: float | None = None) -> None:
         if half_width is not None and not (isinstance(half_width, int | float) and 0 < half_width < np.inf):
             raise ValueError(f"features_extractor_kwargs['half_width'] must be positive, finite or None, got {half_width!r}")
         super().__init__(observation_space, get_flattened_obs_dim(observation_space))

@@ -17,7 +17,7 @@ from sb3_ddiffpg.features import ScaledFlattenExtractor
 def default_extractor(observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
     """
     :param observation_space: Observation space
-    :return: What scales bounded observations, or combines those of a dict
+    :return: What flattens observations, or combines those of a dict
     """
     return CombinedExtractor if isinstance(observation_space, spaces.Dict) else ScaledFlattenExtractor
 

@@ -22,7 +22,7 @@ def test_bounds_come_to_lie_where_they_are_told(low, width, half_width, share):
 
 
 def test_a_model_is_told_by_its_policys_arguments():
-    for kwargs, seen in (({}, [3.0, -1.5]), ({"half_width": 8}, [8.0, -4.0]), ({"half_width": None}, [2.0, -1.0])):
+    for kwargs, seen in (({}, [2.0, -1.0]), ({"half_width": 8}, [8.0, -4.0])):
         model = small_model(TwoEnds(), policy_kwargs={"net_arch": [16], "features_extractor_kwargs": kwargs})
         for extractor in (model.actor.features_extractor, model.policy.critic_features_extractor):
             np.testing.assert_allclose(extractor(th.tensor([[2.0, -1.0]])), [seen])  # TwoEnds' bounds are -2 and 2

@@ -297,7 +297,7 @@ class DistanceFromOrigin(th.nn.Module):
 
     @th.no_grad()
     def novelty(self, positions, observations):
-        assert observations.shape == (len(positions), 2) and observations.abs().max() <= 1.0 + 1e-6  # the scaled features
+        assert observations.shape == (len(positions), 2) and observations.abs().max() <= 1.0 + 1e-6  # what the networks see
         return positions.abs().sum(dim=1) / self.unit / self.far
 
     def update(self, positions, observations):
@@ -309,7 +309,9 @@ class DistanceFromOrigin(th.nn.Module):
 
 
 def test_a_measure_of_ones_own(tmp_path):
-    model = small_model(DummyVecEnv([TwoEnds] * 4), novelty=DistanceFromOrigin, novelty_kwargs={"unit": 2.0})
+    seen = {"net_arch": [16], "features_extractor_kwargs": {"half_width": 1}}
+    measure = {"novelty": DistanceFromOrigin, "novelty_kwargs": {"unit": 2.0}}
+    model = small_model(DummyVecEnv([TwoEnds] * 4), **measure, policy_kwargs=seen)
     model.learn(160)
     assert isinstance(model.novelty_model, DistanceFromOrigin) and model.novelty_model.unit == 2.0
     assert model.novelty_model.n_seen.item() == 160 and model.novelty_model.far.item() != 1.0
