@@ -26,6 +26,7 @@ from sb3_ddiffpg.trajectories import NO_MODE
 #: Share of episodes from which on a way counts as one that the model robustly takes
 ROBUST_SHARE = 0.05
 _FORMAT = 1
+_MOST_EPISODES = 2**31 - 1  # of a command, so that tables of them are counted in 64 bits
 # Of a success that is like no other
 _NO_WAY = ""
 
@@ -267,6 +268,10 @@ class ModeEvaluation:
                 raise ValueError(f"{_command_name(each.mode)}: the numbers of episodes contradict each other")
             if each.n_successes > each.n_episodes:
                 raise ValueError(f"{_command_name(each.mode)}: more successes than episodes")
+            if each.n_episodes > _MOST_EPISODES:
+                raise ValueError(
+                    f"{_command_name(each.mode)}: {each.n_episodes} episodes; accepted are up to {_MOST_EPISODES}"
+                )
         return found
 
 

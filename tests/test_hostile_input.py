@@ -10,6 +10,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import yaml
 from environments import TwoEnds, copied, small_model
 from gymnasium import spaces
@@ -307,6 +308,14 @@ def test_an_evaluation_with_something_else_in_it(data):
         assert str(error)
         return
     assert found.commanded_modes >= 0 and found.expected_modes() >= 0
+
+
+def test_an_evaluation_of_more_episodes_than_can_be_counted():
+    path, tree = folder() / "evaluation.json", json.loads(evaluated())
+    tree["commanded"][0]["n_episodes"] = 2**70
+    path.write_text(json.dumps(tree))
+    with pytest.raises(ValueError, match="episodes; accepted are up to"):
+        ModeEvaluation.load(path)
 
 
 @cache
