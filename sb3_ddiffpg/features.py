@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 Observation = np.ndarray | dict[str, np.ndarray]
@@ -16,7 +16,7 @@ Observation = np.ndarray | dict[str, np.ndarray]
 LARGEST_USEFUL_BOUND = 1e4
 
 
-class ScaledFlattenExtractor(BaseFeaturesExtractor):
+class ScaledFlattenExtractor(FlattenExtractor):
     """
     Flattens the observation. If told to, maps every component with declared finite bounds to ``[-half_width, half_width]``, so
     that what the networks see does not depend on the unit. In a narrow interval they tell places apart less well; in a wide
@@ -33,13 +33,16 @@ class ScaledFlattenExtractor(BaseFeaturesExtractor):
     def __init__(self, observation_space: spaces.Space, half_width: float | None = None) -> None:
         if half_width is not None and not (isinstance(half_width, int | float) and 0 < half_width < np.inf):
             raise ValueError(f"features_extractor_kwargs['half_width'] must be positive, finite or None, got {half_width!r}")
-        super().__init__(observation_space, get_flattened_obs_dim(observation_space))
+        super().__init__(observation_space)
+        self.scales = False
+        if half_width is None or not isinstance(observation_space, spaces.Box) or is_image_space(observation_space):
+            return
+        self.scales = True
+        low, high = observation_space.low.ravel().astype(np.float64), observation_space.high.ravel().astype(np.float64)
+        bounded = (np.abs(low) < LARGEST_USEFUL_BOUND) & (np.abs(high) < LARGEST_USEFUL_BOUND) & (low < high)
         offset, scale = np.zeros(self.features_dim), np.ones(self.features_dim)
-        if half_width is not None and isinstance(observation_space, spaces.Box) and not is_image_space(observation_space):
-            low, high = observation_space.low.ravel().astype(np.float64), observation_space.high.ravel().astype(np.float64)
-            bounded = (np.abs(low) < LARGEST_USEFUL_BOUND) & (np.abs(high) < LARGEST_USEFUL_BOUND) & (low < high)
-            offset[bounded] = (low[bounded] + high[bounded]) / 2
-            scale[bounded] = 2 * half_width / (high[bounded] - low[bounded])
+        offset[bounded] = (low[bounded] + high[bounded]) / 2
+        scale[bounded] = 2 * half_width / (high[bounded] - low[bounded])
         self.register_buffer("offset", th.as_tensor(offset, dtype=th.float32), persistent=False)
         self.register_buffer("scale", th.as_tensor(scale, dtype=th.float32), persistent=False)
 
@@ -48,7 +51,8 @@ class ScaledFlattenExtractor(BaseFeaturesExtractor):
         :param observations: Shape [N, *observation_space.shape]
         :return: Shape [N, features_dim]
         """
-        return (observations.flatten(1) - self.offset) * self.scale
+        flat = super().forward(observations)
+        return (flat - self.offset) * self.scale if self.scales else flat
 
 
 def declared_mode_features(env: VecEnv) -> Any:
