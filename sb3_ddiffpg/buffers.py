@@ -13,6 +13,7 @@ from sb3_ddiffpg.behavior import EXPLORATORY_GROUP
 from sb3_ddiffpg.dtw import LOOP_SHARE, N_PATH_POINTS, comparable_path
 from sb3_ddiffpg.exploration_buffer import ExplorationReplayBuffer, positive_length
 from sb3_ddiffpg.known_ways import NO_WAY, Way
+from sb3_ddiffpg.returns import group_returns
 from sb3_ddiffpg.row_storage import Fields
 from sb3_ddiffpg.trajectories import NO_MODE, DistanceCache, RowSet, Trajectory
 
@@ -484,36 +485,23 @@ class ModeReplayBuffer(ExplorationReplayBuffer):
             n_new = round(self.new_way_share * n)
             rows[EXPLORATORY_GROUP, :n_new] = np.random.choice(self._new_way_rows, n_new)
         windows, notes = self._windows(rows, exploration_n_steps, mode_n_steps)
-        present = windows >= 0
-        gammas = np.full((n_groups, 1), gamma, dtype=np.float32)
+        gammas = np.full(n_groups, gamma, dtype=np.float32)
         if exploration_gamma is not None:
             gammas[EXPLORATORY_GROUP] = exploration_gamma
-        powers = gammas[..., None] ** np.arange(windows.shape[-1], dtype=np.float32)
-        rewards = self._normalize_reward(notes["rewards"].ravel(), env).reshape(windows.shape)
-        # For its mode a step off the route ends the episode without reward, so that no way back is worth anything
-        lost = np.logical_or.accumulate(notes["off_route"] & present, axis=-1)
-        lost[EXPLORATORY_GROUP] = False
+        returns = group_returns(
+            windows,
+            notes,
+            self._normalize_reward(notes["rewards"].ravel(), env).reshape(windows.shape),
+            gammas,
+            past_known_ways=self.known_ways.include(notes["followed"][EXPLORATORY_GROUP]),
+            explore_beyond_goals=self.explore_beyond_goals,
+            new_ways_pay=self.new_way_share > 0,
+        )
         # What led away from the route is for the critic to judge, not for the policy to follow
         imitated = active[:, None] & ~notes["foreign"][..., 0]
         imitated[EXPLORATORY_GROUP] = True
-        rewards = np.where(present & ~lost, rewards, 0.0) * powers
-        new_ways = (rewards[EXPLORATORY_GROUP] * notes["way_novelty"][EXPLORATORY_GROUP]).sum(axis=-1)  # [n]
-        rewards = rewards.sum(axis=-1)  # [G, n]
-        lengths = present.sum(axis=-1)
-        ends = lengths[..., None] - 1
-        last = np.take_along_axis(windows, ends, axis=-1).ravel()
-        ended = np.take_along_axis(notes["dones"] & ~notes["timeouts"], ends, axis=-1)[..., 0]
-        if self.explore_beyond_goals:
-            # A goal that ended what exploring is worth would be the one place that explorers keep away from. One that is paid
-            # for ends it, or it would be paid again and again
-            unpaid = notes["goals"] & ~((notes["way_novelty"] > 0) & (self.new_way_share > 0))
-            ended[EXPLORATORY_GROUP] &= ~np.take_along_axis(unpaid, ends, axis=-1)[EXPLORATORY_GROUP, :, 0]
-        past = self.known_ways.include(notes["followed"][EXPLORATORY_GROUP]) & present[EXPLORATORY_GROUP]
-        # Nor is what lies past a known way worth anything to explorers who came along it
-        ended[EXPLORATORY_GROUP] |= past.any(axis=-1)
-        discounts = gammas**lengths * ~(ended | lost.any(axis=-1))
         steps = self._on_device(self._steps.tensors(rows.ravel()))
-        nexts = self._on_device(self._nexts.tensors(last))
+        nexts = self._on_device(self._nexts.tensors(returns.last.ravel()))
         actions, exploratory, targets = (
             steps[name].view(*rows.shape, self.action_dim)
             for name in ("actions", "exploratory_target_actions", "target_actions")
@@ -523,13 +511,13 @@ class ModeReplayBuffer(ExplorationReplayBuffer):
             actions=actions,
             target_actions=th.cat((exploratory[:1], targets[1:])),
             next_observations=self.normalized(self._as_observation(nexts, "next_observations"), env),
-            rewards=self._to_device(rewards.astype(np.float32)),
-            discounts=self._to_device(discounts.astype(np.float32)),
+            rewards=self._to_device(returns.rewards.astype(np.float32)),
+            discounts=self._to_device(returns.discounts.astype(np.float32)),
             active=self._to_device(active),
             imitated=self._to_device(imitated),
-            new_ways=self._to_device(new_ways.astype(np.float32)),
+            new_ways=self._to_device(returns.new_ways.astype(np.float32)),
             rows=rows,
-            windows=np.where(lost, -1, windows),
+            windows=np.where(returns.lost, -1, windows),
         )
 
     def _windows(self, rows: np.ndarray, exploration_n_steps: int, mode_n_steps: int) -> tuple[np.ndarray, np.ndarray]:

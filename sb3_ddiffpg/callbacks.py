@@ -15,8 +15,9 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_ddiffpg.checkpoints import nested_callbacks
 from sb3_ddiffpg.episodes import run_episodes
-from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
+from sb3_ddiffpg.evaluation import evaluate_modes
 from sb3_ddiffpg.history import ModeEvent
+from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 from sb3_ddiffpg.rng import preserved_rng
 from sb3_ddiffpg.safe_files import convert
 from sb3_ddiffpg.trajectories import read_success

@@ -25,8 +25,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 from sb3_ddiffpg import pictures, plots
 from sb3_ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import is_ours, make_vec_env
-from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
+from sb3_ddiffpg.evaluation import evaluate_modes
 from sb3_ddiffpg.experiments.machine import versions
+from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 
 # Of an evaluation's episodes, so many are drawn for each mode
 _ROUTES_DRAWN = 20

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
+from sb3_ddiffpg.evaluation import evaluate_modes
+from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ from test_episodes import Scripted
 
 from sb3_ddiffpg import DDiffPG, EvaluateModesCallback
 from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.evaluation import CommandResult, ModeEvaluation, WayResult, evaluate_modes
+from sb3_ddiffpg.evaluation import evaluate_modes
+from sb3_ddiffpg.mode_evaluation import CommandResult, ModeEvaluation, WayResult
 
 
 def result(mode, n, labels):

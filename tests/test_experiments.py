@@ -17,9 +17,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.callbacks import EvaluateModesCallback
-from sb3_ddiffpg.evaluation import ModeEvaluation
 from sb3_ddiffpg.experiments import __main__ as cli
 from sb3_ddiffpg.experiments.curve import Clock, CurveCallback
+from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 
 SMALL = "{n_timesteps: 1600, learning_starts: 320, n_envs: 4, policy_kwargs: 'dict(net_arch=[16])'}"
 

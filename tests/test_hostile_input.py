@@ -23,8 +23,9 @@ from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.buffer_state import buffer_state, restore_buffer
 from sb3_ddiffpg.dtw import dtw_distances
 from sb3_ddiffpg.envs.mazes import Maze
-from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
+from sb3_ddiffpg.evaluation import evaluate_modes
 from sb3_ddiffpg.experiments.suite import read_suite
+from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 from sb3_ddiffpg.model_file import build_model, model_tree
 from sb3_ddiffpg.modes import ModeTable
 from sb3_ddiffpg.safe_files import read

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from maze_routes import ROUTES, polyline
 
-from sb3_ddiffpg.envs.mazes import CELL_SIZE, LISTED_ROUTES, MAZES, HomotopyTracker, Maze, cell_distances, reduce_word
+from sb3_ddiffpg.envs.homotopy import HomotopyTracker
+from sb3_ddiffpg.envs.mazes import CELL_SIZE, LISTED_ROUTES, MAZES, Maze, cell_distances, reduce_word
 
 # Four islands: a ring (with a room that nobody can enter, and a pillar in it), a pillar above the start, one that is two
 # cells high, whose cut ends at a wall grown from the border, and one below the goal, whose cut passes through the goal.

@@ -21,8 +21,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_ddiffpg import DDiffPG, EvaluateModesCallback, ModeFigureCallback
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.episodes import EpisodeResult
-from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
+from sb3_ddiffpg.evaluation import evaluate_modes
 from sb3_ddiffpg.history import ModeEvent, ModeHistory, ModeState
+from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 from sb3_ddiffpg.pictures import CAPTIONS, draw_all
 from sb3_ddiffpg.plots import (
     grid_observations,

@@ -14,11 +14,11 @@ from scipy.stats import trim_mean
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.evaluation import CommandResult, ModeEvaluation
 from sb3_ddiffpg.experiments import __main__ as cli
 from sb3_ddiffpg.experiments import card, figures, store, summary
 from sb3_ddiffpg.experiments.report import make_report
 from sb3_ddiffpg.experiments.wall_clock import Stopwatch
+from sb3_ddiffpg.mode_evaluation import CommandResult, ModeEvaluation
 
 ENV = "PointMazeV1-v0"
 

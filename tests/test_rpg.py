@@ -15,8 +15,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg.baselines import RPG
-from sb3_ddiffpg.evaluation import ModeEvaluation
 from sb3_ddiffpg.experiments import __main__ as cli
+from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 
 
 def small(env=None, **changes):

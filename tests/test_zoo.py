@@ -24,7 +24,7 @@ from torch import nn, optim
 from sb3_ddiffpg import DDiffPG, zoo
 from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.envs import PointMazeVecEnv
-from sb3_ddiffpg.zoo import ModeExperimentManager, check_hyperparameters, main
+from sb3_ddiffpg.zoo import ModeExperimentManager, check_hyperparameters, main, search
 
 ENV = "PointMazeV1-v0"
 # The goal is next to the start: random actions find it
@@ -223,9 +223,9 @@ def test_sampled_hyperparameters_are_accepted(algo):
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(5):
         trial = study.ask()
-        sampled = zoo.sample_params(algo, trial, 2, 1, {})
+        sampled = search.sample_params(algo, trial, 2, 1, {})
         # --trial-id rebuilds them from what the study has stored
-        assert zoo.convert_params(trial.params) == sampled
+        assert search.convert_params(trial.params) == sampled
         assert trial.user_attrs == {"gamma": sampled["gamma"], "batch_size": sampled["batch_size"]}
         ALGOS[algo]("MlpPolicy", env, **sampled)
 

@@ -10,7 +10,8 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 from stable_baselines3.common.env_util import make_vec_env as make_sb3_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
-from sb3_ddiffpg.envs.mazes import LISTED_ROUTES, MAZES, HomotopyTracker, Maze, reduce_word
+from sb3_ddiffpg.envs.homotopy import HomotopyTracker
+from sb3_ddiffpg.envs.mazes import LISTED_ROUTES, MAZES, Maze, reduce_word
 from sb3_ddiffpg.envs.point import PointMazeEnv, PointMazeVecEnv
 from sb3_ddiffpg.envs.workers import WorkerVecEnv
 from sb3_ddiffpg.envs.wrappers import HideGoal

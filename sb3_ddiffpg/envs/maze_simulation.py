@@ -11,7 +11,8 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_ddiffpg.envs.drawing import OBSTACLE, Image, draw_maze, fill_square
-from sb3_ddiffpg.envs.mazes import CELL_SIZE, FloatArray, HomotopyTracker, Maze, MazeMap, cell_distances
+from sb3_ddiffpg.envs.homotopy import HomotopyTracker
+from sb3_ddiffpg.envs.mazes import CELL_SIZE, FloatArray, Maze, MazeMap, cell_distances
 from sb3_ddiffpg.safe_files import check_array, convert
 
 Cell = tuple[int, int]

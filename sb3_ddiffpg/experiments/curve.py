@@ -11,8 +11,8 @@ from typing import Any
 import psutil
 
 from sb3_ddiffpg.callbacks import EvaluateModesCallback
-from sb3_ddiffpg.evaluation import ModeEvaluation
 from sb3_ddiffpg.experiments.wall_clock import Stopwatch
+from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 from sb3_ddiffpg.safe_files import convert
 from sb3_ddiffpg.trajectories import read_success
 

@@ -23,7 +23,7 @@ from sb3_ddiffpg.actor_critic import NoveltyActorCritic
 from sb3_ddiffpg.callbacks import score
 from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.envs import is_ours, make_vec_env
-from sb3_ddiffpg.evaluation import ModeEvaluation, evaluate_modes
+from sb3_ddiffpg.evaluation import evaluate_modes
 from sb3_ddiffpg.experiments.curve import CurveCallback
 from sb3_ddiffpg.experiments.progress import Progress, ProgressCallback, write_progress
 from sb3_ddiffpg.experiments.record import (
@@ -35,6 +35,7 @@ from sb3_ddiffpg.experiments.record import (
     write_record,
 )
 from sb3_ddiffpg.experiments.trial import Tests, Trial, hyperparameters
+from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 from sb3_ddiffpg.persistence import SavableAlgorithm
 from sb3_ddiffpg.replanning import Replanner
 from sb3_ddiffpg.union import evaluate_union

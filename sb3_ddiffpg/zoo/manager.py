@@ -1,0 +1,101 @@
+"""The zoo's manager of one training, for this package's algorithms and tasks."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.utils import SimpleLinearSchedule
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
+
+from sb3_ddiffpg.baselines import BASELINES
+from sb3_ddiffpg.checkpoints import RunCheckpointCallback
+from sb3_ddiffpg.envs import is_ours, make_vec_env
+from sb3_ddiffpg.schedules import LateLinearSchedule
+from sb3_ddiffpg.zoo.settings import ALGO, ALGOS, check_hyperparameters
+
+# How a learning rate may be given: 3e-4, `lin_3e-4`, `late_3e-4`
+SCHEDULES: dict[str, Callable[[float], Any]] = {"": float, "lin": SimpleLinearSchedule, "late": LateLinearSchedule}
+
+
+class ModeExperimentManager(ExperimentManager):
+    """
+    The zoo's manager, which refuses unknown hyperparameters, steps this package's tasks all at once, and evaluates this
+    package's algorithms with sampled actions: a deterministic evaluation would show one mode only.
+    """
+
+    def __init__(self, *args: Any, checkpoint_freq: int = 0, resume: Path | None = None, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.checkpoint_freq, self.resume = checkpoint_freq, resume
+        self.is_own = self.algo == ALGO or self.algo in BASELINES
+        if self.is_own:
+            self.deterministic_eval = False
+        if resume is not None:
+            self.continue_training = True  # with what ``_load_pretrained_agent`` gives
+            self.save_path = str(resume)
+            self.params_path = f"{resume}/{self.env_name}"
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        check_hyperparameters(self.algo, list(hyperparams))
+        return super()._preprocess_hyperparams(hyperparams)
+
+    @staticmethod
+    def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
+        # The zoo knows `lin_3e-4` for the learning rate alone, takes every name for `lin`, and YAML reads 3e-4 as a string
+        schedules = {}
+        for key in ("learning_rate", "qf_learning_rate"):
+            value = hyperparams.get(key)
+            if isinstance(value, str):
+                kind, _, number = value.rpartition("_")
+                try:
+                    schedules[key] = SCHEDULES[kind](float(number))
+                except (KeyError, ValueError):
+                    accepted = "a number, 'lin_<number>' or 'late_<number>'"
+                    raise TypeError(f"{key} must be {accepted}, got {value!r}") from None
+        others = {key: value for key, value in hyperparams.items() if key not in schedules}
+        return {**ExperimentManager._preprocess_schedules(others), **schedules}
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        if self.resume is not None:
+            own: Any = ALGOS[self.algo]
+            settings = {"verbose": self.verbose, "tensorboard_log": self.tensorboard_log, "device": self.device}
+            resumed: BaseAlgorithm = own.resume(self.resume / "checkpoints", env, **settings)
+            print(f"Going on at step {resumed.num_timesteps} of {self.n_timesteps}")
+            return resumed
+        model = super()._load_pretrained_agent(hyperparams, env)
+        # The zoo counts steps from zero again; with a full buffer the random warm-up would only do harm
+        if self.is_own and model.replay_buffer.size() > 0:  # type: ignore[attr-defined]
+            model.learning_starts = 0  # type: ignore[attr-defined]
+        return model
+
+    def create_callbacks(self) -> None:
+        """The zoo's, and checkpoints of the whole run."""
+        super().create_callbacks()
+        if self.is_own and self.checkpoint_freq > 0 and not self.optimize_hyperparameters:
+            folder = Path(self.save_path) / "checkpoints"
+            self.callbacks.append(RunCheckpointCallback(folder, self.checkpoint_freq, verbose=self.verbose))
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        """
+        :param n_envs: Number of environments
+        :param eval_env: Whether they serve the evaluation
+        :param no_log: Whether to write no monitor file
+        :return: Environments that step together for the tasks of this package, otherwise what the zoo makes
+        """
+        env_id = self.env_name.gym_id
+        wrapped = self.env_wrapper is not None or self.frame_stack is not None
+        if not is_ours(env_id) or wrapped or self.vec_env_class is SubprocVecEnv:
+            return super().create_envs(n_envs, eval_env, no_log)
+        env_kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
+        # A run that goes on must not lose what it has noted
+        n_before = len(list(Path(self.save_path).glob("*.monitor.csv")))
+        monitor_file = None if eval_env or no_log else os.path.join(self.save_path, str(n_before))
+        env = make_vec_env(env_id, n_envs, seed=self.seed, **env_kwargs)
+        if isinstance(env, VecMonitor):  # it writes no file
+            env = env.venv
+        env = VecMonitor(env, monitor_file, **{"info_keywords": ("is_success",), **self.monitor_kwargs})
+        if self.vec_env_wrapper is not None:
+            env = self.vec_env_wrapper(env)
+        return self._maybe_normalize(env, eval_env)

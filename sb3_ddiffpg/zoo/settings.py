@@ -1,0 +1,58 @@
+"""Settings of an algorithm in the zoo: the YAML files, and what they may say."""
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+
+from rl_zoo3.utils import ALGOS
+
+from sb3_ddiffpg.model_file import constructor_arguments
+
+ALGO = "ddiffpg"
+
+# Keys of the zoo's YAML files that its ExperimentManager takes out before it calls the algorithm
+ZOO_KEYS = {
+    "callback",
+    "env_kwargs",
+    "env_wrapper",
+    "frame_stack",
+    "monitor_kwargs",
+    "n_envs",
+    "n_timesteps",
+    "noise_std",
+    "noise_type",
+    "normalize",
+    "vec_env_wrapper",
+}
+# Constructor arguments that come from the command line
+COMMAND_LINE_ARGUMENTS = {"env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
+
+
+def config_file(name: str) -> Path | None:
+    """
+    :param name: Of a YAML file of ours: ``ddiffpg`` or ``ddiffpg-cpu``
+    :return: Where it is, installed or in a checkout; None when there is none
+    """
+    package = Path(__file__).parent.parent
+    for folder in (package, package.parent):
+        if (path := folder / "zoo_hyperparams" / f"{name}.yml").is_file():
+            return path
+    return None
+
+
+def check_hyperparameters(algo: str, keys: Sequence[str]) -> None:
+    """
+    The zoo hands unknown keys on when it builds a model, and drops them silently when it resumes one.
+
+    :param algo: Name of an algorithm in the zoo
+    :param keys: Names of hyperparameters, from a YAML file or the command line
+    :raises TypeError: If one is neither a key of the zoo nor an argument of the algorithm. Not a ValueError: the zoo
+        takes those for an unlucky trial when it optimises.
+    """
+    arguments = constructor_arguments(ALGOS[algo]) - COMMAND_LINE_ARGUMENTS
+    for key in keys:
+        if key in arguments or key in ZOO_KEYS:
+            continue
+        near = difflib.get_close_matches(key, sorted(arguments | ZOO_KEYS))
+        hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"it takes {', '.join(sorted(arguments))}"
+        raise TypeError(f"{key!r} is not a hyperparameter of {algo}: {hint}")
