@@ -15,7 +15,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
 from sb3_ddiffpg.critics import ModeCritics
@@ -26,6 +25,7 @@ from sb3_ddiffpg.features import declared_cell_size, declared_mode_features, des
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES, RunningMoments, VisitCounts, noveld_reward
 from sb3_ddiffpg.noise import SpreadNormalActionNoise
 from sb3_ddiffpg.persistence import SavableAlgorithm
+from sb3_ddiffpg.policy_parts import average_networks
 from sb3_ddiffpg.trajectories import Trajectory
 from sb3_ddiffpg.twin_critic_policy import TwinCriticPolicy
 from sb3_ddiffpg.validation import check_arguments
@@ -96,8 +96,8 @@ class NoveltyActorCritic(SavableAlgorithm):
     policy: TwinCriticPolicy
     actor: Any
     replay_buffer: ModeReplayBuffer
-    # The argument that limits the values of the first group, which explores
-    _exploration_limit: ClassVar[str] = "v_max"
+    # Of the first group: what an error calls its critics, the argument that limits their values, and those that scale them
+    _first_group: ClassVar[tuple[str, str, str]] = ("critics", "v_max", "reward_scale or intrinsic_coef")
 
     def __init__(
         self,
@@ -324,10 +324,10 @@ class NoveltyActorCritic(SavableAlgorithm):
             self.logger.record(f"train/{name}", mean)
         if means.get(CUT_VALUES, 0.0) > MOST_CUT_VALUES and not self._warned_cut_values:
             self._warned_cut_values = True
-            limit, value = self._exploration_limit, self.critics.upper[0].item()
+            (critics, limit, scales), value = self._first_group, self.critics.upper[0].item()
             warnings.warn(
-                f"{means[CUT_VALUES]:.0%} of the exploratory critics' targets are cut off at {limit}={value:g}, "
-                f"where one place is as good as another and exploration stops: raise {limit} or lower intrinsic_coef"
+                f"{means[CUT_VALUES]:.0%} of the {critics}' targets are cut off at {limit}={value:g}, "
+                f"where one place is as good as another and exploration stops: raise {limit} or lower {scales}"
             )
 
     def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
@@ -451,14 +451,8 @@ class NoveltyActorCritic(SavableAlgorithm):
 
     def _update_targets(self) -> None:
         policy = self.policy
-        online = [*policy.critics.parameters(), *policy.critic_features_extractor.parameters()]
-        targets = [*policy.critics_target.parameters(), *policy.critic_features_extractor_target.parameters()]
-        # Polyak averaging, in one kernel
-        get_ema_multi_avg_fn(1 - self.tau)(targets, online, None)
-        # Running statistics of a batch norm are copied, as in SB3
-        statistics = policy.critic_features_extractor.buffers(), policy.critic_features_extractor_target.buffers()
-        for current, target in zip(*statistics, strict=True):
-            target.copy_(current)
+        online = policy.critics, policy.critic_features_extractor
+        average_networks(online, (policy.critics_target, policy.critic_features_extractor_target), self.tau)
 
     def _update_learning_rates(self) -> None:
         progress = self._current_progress_remaining

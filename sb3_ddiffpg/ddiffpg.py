@@ -149,7 +149,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     policy: DiffusionPolicy
     actor: DiffusionActor
     replay_buffer: ModeReplayBuffer
-    _exploration_limit = "exploration_v_max"
+    _first_group = ("exploratory critics", "exploration_v_max", "intrinsic_coef")
     _counters: ClassVar[dict[str, Any]] = {"n_rollouts": int, "_next_mode_number": int, "_steps_before": int}
 
     def __init__(

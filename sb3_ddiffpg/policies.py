@@ -106,7 +106,7 @@ class DiffusionPolicy(TwinCriticPolicy):
     :param net_arch: Hidden layers, a list or ``dict(pi=[...], qf=[...])``
     :param activation_fn: Activation of the denoiser
     :param critic_activation_fn: Activation of the critics
-    :param features_extractor_class: Features extractor; scales bounded observations when None, combines dict observations
+    :param features_extractor_class: Features extractor; when None, observations are flattened, and those of a dict combined
     :param features_extractor_kwargs: Its keyword arguments
     :param normalize_images: Whether images are divided by 255
     :param optimizer_class: Optimiser of actor and critics

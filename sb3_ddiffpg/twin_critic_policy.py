@@ -12,6 +12,7 @@ from torch import nn
 
 from sb3_ddiffpg.critics import ModeCritics
 from sb3_ddiffpg.features import ScaledFlattenExtractor
+from sb3_ddiffpg.policy_parts import SavablePolicy
 
 
 def default_extractor(observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
@@ -61,7 +62,7 @@ class Actor(BasePolicy):
         return self(observation, deterministic)
 
 
-class TwinCriticPolicy(BasePolicy):
+class TwinCriticPolicy(SavablePolicy):
     """
     An actor, twin critics and their targets, each with a features extractor of its own.
 
@@ -73,7 +74,7 @@ class TwinCriticPolicy(BasePolicy):
     :param actor_kwargs: Its further arguments
     :param net_arch: Hidden layers, a list or ``dict(pi=[...], qf=[...])``
     :param critic_activation_fn: Activation of the critics
-    :param features_extractor_class: Features extractor; scales bounded observations when None, combines dict observations
+    :param features_extractor_class: Features extractor; when None, observations are flattened, and those of a dict combined
     :param features_extractor_kwargs: Its keyword arguments
     :param normalize_images: Whether images are divided by 255
     :param optimizer_class: Optimiser of actor and critics
@@ -118,10 +119,9 @@ class TwinCriticPolicy(BasePolicy):
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
-            squash_output=True,
             normalize_images=normalize_images,
         )
-        self._constructor: dict[str, Any] = dict(
+        self._constructor = dict(
             net_arch=net_arch,
             critic_activation_fn=critic_activation_fn,
             n_critics=n_critics,
@@ -161,30 +161,11 @@ class TwinCriticPolicy(BasePolicy):
         self.critic_features_extractor = self.make_features_extractor()
         self.critic_features_extractor_target = self.make_features_extractor()
         self.critic_features_extractor_target.load_state_dict(self.critic_features_extractor.state_dict())
-        chosen = {"fused", "foreach", "differentiable"} & set(self.optimizer_kwargs)
-        if not chosen and optimizer_class in (th.optim.Adam, th.optim.AdamW):
-            # One kernel instead of one per parameter: a third of a small update's time
-            optimizer_kwargs = {"fused": True, **self.optimizer_kwargs}
-        else:
-            optimizer_kwargs = self.optimizer_kwargs
-        make: Any = optimizer_class
-        self.actor.optimizer = make(self.actor.parameters(), lr=lr_schedule(1), **optimizer_kwargs)
+        self.actor.optimizer = self.make_optimizer(self.actor.parameters(), lr_schedule(1))
         parameters = [*self.critics.parameters(), *self.critic_features_extractor.parameters()]
-        self.critics.optimizer = make(parameters, lr=lr_schedule(1), **optimizer_kwargs)
+        self.critics.optimizer = self.make_optimizer(parameters, lr_schedule(1))
         self.critics_target.train(False)
         self.critic_features_extractor_target.train(False)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        data.update(
-            self._constructor,
-            lr_schedule=self._dummy_schedule,
-            optimizer_class=self.optimizer_class,
-            optimizer_kwargs=self.optimizer_kwargs,
-            features_extractor_class=self.features_extractor_class,
-            features_extractor_kwargs=self.features_extractor_kwargs,
-        )
-        return data
 
     def critic_features(self, obs: PyTorchObs, target: bool = False) -> th.Tensor:
         """

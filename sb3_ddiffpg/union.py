@@ -49,40 +49,46 @@ class Union:
     def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
+        state: tuple[Any, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
         mode: str | int | None = None,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    ) -> tuple[np.ndarray, tuple[Any, ...]]:
         """
         :param observation: A batch of observations
-        :param state: What the previous call returned: which member acts in every environment
+        :param state: What the previous call returned: which member acts in every environment, and the members' own states
         :param episode_start: Which environments begin an episode; members are drawn where they do
         :param deterministic: Passed to the members
         :param mode: Name or number of the member that acts; None: a drawn one
         :return: The actions and the state for the next call
-        :raises ValueError: If there is no such member
+        :raises ValueError: If there is no such member, or the observation is not a batch
         """
-        first = next(iter(observation.values())) if isinstance(observation, dict) else observation
-        acting = np.full(len(first), -1) if state is None else np.array(state[0])
+        n = self._batch_size(observation)
+        acting, states = (np.full(n, -1), [None] * len(self.models)) if state is None else (state[0].copy(), list(state[1]))
+        starts = (acting < 0) if episode_start is None else np.asarray(episode_start, dtype=bool) | (acting < 0)
         if mode is not None:
             names = [member.name for member in self.modes]
             if mode not in names and mode not in range(len(names)):
                 raise ValueError(f"mode={mode!r} is unknown; the members are {names}")
             acting[:] = names.index(mode) if isinstance(mode, str) else mode
         else:
-            starts = (acting < 0) if episode_start is None else np.asarray(episode_start, dtype=bool) | (acting < 0)
             acting[starts] = np.random.randint(len(self.models), size=int(starts.sum()))
-        actions: np.ndarray | None = None
+        actions: dict[int, np.ndarray] = {}
         for number in np.unique(acting):
-            rows = np.flatnonzero(acting == number)
-            part = {k: v[rows] for k, v in observation.items()} if isinstance(observation, dict) else observation[rows]
-            chosen = self.models[number].predict(part, deterministic=deterministic)[0]
-            if actions is None:
-                actions = np.empty((len(first), *chosen.shape[1:]), dtype=chosen.dtype)
-            actions[rows] = chosen
-        assert actions is not None
-        return actions, (acting,)
+            # Of all environments: only the member itself knows which part of its state belongs to which
+            actions[number], states[number] = self.models[number].predict(
+                observation, state=states[number], episode_start=starts, deterministic=deterministic
+            )
+        return np.stack([actions[number][row] for row, number in enumerate(acting)]), (acting, states)
+
+    def _batch_size(self, observation: np.ndarray | dict[str, np.ndarray]) -> int:
+        space: Any = self.models[0].observation_space
+        if isinstance(observation, dict):
+            key = next(iter(observation))
+            observation, space = observation[key], space[key]
+        if np.ndim(observation) != len(space.shape) + 1:
+            raise ValueError(f"observation: shape {list(np.shape(observation))} given; accepted is [N, *{list(space.shape)}]")
+        return len(observation)
 
 
 def evaluate_union(models: Sequence[Any], env: Any, n_episodes: int = 100, **kwargs: Any) -> ModeEvaluation:

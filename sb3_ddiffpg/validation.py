@@ -39,18 +39,26 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
             *("n_diffusion_steps", "n_action_gradient_steps", "n_critics", "n_atoms", "mode_n_steps", "exploration_n_steps"),
             *("recluster_freq", "max_modes", "min_mode_size", "max_successes_per_mode", "max_failures_per_mode"),
             *("mode_embedding_dim", "mode_trials", "batch_size", "buffer_size", "n_steps"),
+            *("policy_delay", "n_candidates", "average_freq", "target_update_interval", "latent_dim"),
         ),
         "be an integer of at least 1",
         lambda value: _is_integer(value) and value >= 1,
     ),
-    (("learning_starts", "mode_patience"), "be an integer of at least 0", lambda value: _is_integer(value) and value >= 0),
+    (
+        ("learning_starts", "mode_patience", "average_start"),
+        "be an integer of at least 0",
+        lambda value: _is_integer(value) and value >= 0,
+    ),
     (("gradient_steps",), "be an integer of at least -1", lambda value: _is_integer(value) and value >= -1),
     (
-        ("gamma", "tau", "mode_mask_prob", "exploration_fraction", "explore_then_exploit", "switch_modes", "min_return_ratio"),
+        (
+            *("gamma", "tau", "mode_mask_prob", "exploration_fraction", "explore_then_exploit", "switch_modes"),
+            *("min_return_ratio", "gae_lambda"),
+        ),
         "lie in [0, 1]",
         _is_share,
     ),
-    (("exploration_gamma",), "lie in [0, 1], or be None", lambda value: value is None or _is_share(value)),
+    (("exploration_gamma", "actor_tau"), "lie in [0, 1], or be None", lambda value: value is None or _is_share(value)),
     (("max_grad_norm",), "be positive", lambda value: _is_number(value) and value > 0),
     (
         ("action_lr", "reward_scale", "intrinsic_clip"),
@@ -63,7 +71,11 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
         lambda value: value is None or (_is_number(value) and 0 < value < np.inf),
     ),
     (
-        ("target_policy_noise", "target_noise_clip", "novelty_scale", "intrinsic_coef", "mode_intrinsic_coef", "new_way_coef"),
+        (
+            *("target_policy_noise", "target_noise_clip", "novelty_scale", "intrinsic_coef", "mode_intrinsic_coef"),
+            *("new_way_coef", "q_coef", "bc_coef", "consistency_coef", "reward_loss_coef", "value_loss_coef"),
+            *("state_loss_coef", "initial_entropy_coef", "entropy_learning_rate"),
+        ),
         "be a finite number of at least 0",
         lambda value: _is_number(value) and 0 <= value < np.inf,
     ),
@@ -81,7 +93,20 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
         lambda value: value is None or callable(value) or _is_share(value),
     ),
     (
-        ("distance_threshold",),
+        ("target_entropy",),
+        "be a finite number or None",
+        lambda value: value is None or (_is_number(value) and np.isfinite(value)),
+    ),
+    (
+        ("n_levels",),
+        "be two integers, of at least 2, in order",
+        lambda value: (
+            isinstance(value, (list, tuple)) and len(value) == 2 and all(map(_is_integer, value)) and 2 <= value[0] <= value[1]
+        ),
+    ),
+    (("own_policy_batch",), "be True or False", lambda value: isinstance(value, (bool, np.bool_))),
+    (
+        ("distance_threshold", "total_gradient_ratio"),
         "be positive or None",
         lambda value: value is None or (_is_number(value) and value > 0),
     ),

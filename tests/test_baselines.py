@@ -1,6 +1,7 @@
 """The baselines: each against something independent, and all as SB3 algorithms."""
 
 import math
+import re
 from collections import defaultdict
 
 import numpy as np
@@ -97,6 +98,42 @@ def test_the_same_seed_is_the_same_run(algorithm):
 def test_bad_arguments_are_named(algorithm):
     for argument, value in (("n_steps", 0), ("gamma", 1.5), ("novelty", "none"), ("v_max", -1.0)):
         with pytest.raises(ValueError, match=argument):
+            small(algorithm, **{argument: value})
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "argument", "values"),
+    [
+        (DIPO, "total_gradient_ratio", (0.0, -1.0, math.nan)),
+        (DIPO, "own_policy_batch", ("no", 1)),
+        (DIPO, "action_optimizer", ("rmsprop",)),
+        (DiffusionQL, "actor_tau", (2.0, -1.0, "x")),
+        (DiffusionQL, "q_coef", (-1.0, math.inf)),
+        (DiffusionQL, "bc_coef", (math.nan, -1.0)),
+        (DiffusionQL, "n_candidates", (0, 1.5)),
+        (DiffusionQL, "average_freq", (0,)),
+        (DiffusionQL, "average_start", (-1, "x")),
+        (DiffusionQL, "noise_schedule", ("linear",)),
+        (ConsistencyAC, "consistency_coef", (-1.0,)),
+        (ConsistencyAC, "n_levels", ((1, 1), (10, 2), 5, (2, 3, 4), (2.0, 3.0))),
+        (ConsistencyAC, "n_diffusion_steps", (0,)),
+        (TD3C51, "policy_delay", (0, -1, 1.5)),
+        (SACC51, "initial_entropy_coef", (-1.0, math.inf)),
+        (SACC51, "entropy_learning_rate", (-1.0,)),
+        (SACC51, "target_entropy", ("auto", math.nan)),
+        (RPG, "gae_lambda", (1.5, -1.0)),
+        (RPG, "latent_dim", (0, -1)),
+        (RPG, "latent_coef", (-1.0, math.nan)),
+        (RPG, "reward_loss_coef", (-1.0,)),
+        (RPG, "value_loss_coef", (math.inf,)),
+        (RPG, "state_loss_coef", (math.nan,)),
+        (RPG, "target_update_interval", (0, 0.5)),
+        (RPG, "n_atoms", (51,)),
+    ],
+)
+def test_bad_arguments_of_one_algorithm_are_named(algorithm, argument, values):
+    for value in values:
+        with pytest.raises(ValueError, match=f"{argument} must .*, got {re.escape(repr(value))}"):
             small(algorithm, **{argument: value})
 
 
@@ -281,7 +318,7 @@ def test_td3_updates_as_sb3s_does():
                 q[2 * layer].bias.copy_(bias[0, twin, 0])
         theirs.actor.mu.load_state_dict(ours.actor.mu.state_dict())
     obs = th.rand(9, 2) * 4 - 2
-    scaled = ours.actor.features(obs)  # ours scales bounded observations
+    scaled = ours.actor.features(obs)
     actions = theirs.actor.mu(scaled)
     th.testing.assert_close(ours.actor(obs), actions)
     q_values = th.stack([q(th.cat((scaled, actions), dim=1)) for q in (theirs.critic.qf0, theirs.critic.qf1)])[..., 0]

@@ -186,6 +186,8 @@ def test_a_union_shares_the_steps(monkeypatch, tmp_path):
     members = [yaml.safe_load((tmp_path / f"member_{k}" / "config.yml").read_text()) for k in range(3)]
     assert [member["seed"] for member in members] == [6, 7, 8]
     assert done["result"]["steps"] == sum(member["result"]["steps"] for member in members) == 2400
+    for part, seconds in done["result"]["seconds"].items():
+        assert seconds == pytest.approx(sum(member["result"]["seconds"][part] for member in members)), part
     found = ModeEvaluation.load(tmp_path / "evaluation.json")
     assert [each.mode for each in found.commanded] == ["model_0", "model_1", "model_2"]
     before = (tmp_path / "member_0" / "model.zip").stat().st_mtime_ns

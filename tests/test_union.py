@@ -8,13 +8,15 @@ from environments import TwoEnds
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.baselines import RPG
 from sb3_ddiffpg.union import Union, evaluate_union
 
 
 class Walks(SimpleNamespace):
     """A model that always walks one way."""
 
-    def predict(self, observation, deterministic=False):
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
         return np.full((len(observation), 1), self.way, dtype=np.float32), None
 
 
@@ -55,6 +57,45 @@ def test_a_member_acts_throughout_an_episode():
     assert not np.array_equal(third[:25], actions[:25])
 
 
+class Wavers(SimpleNamespace):
+    """A model that draws what it does in an episode when that begins, and remembers it in its state."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        drawn = np.random.uniform(*self.within, size=(len(observation), 1))
+        if state is not None:
+            drawn = np.where(np.asarray(episode_start)[:, None], drawn, state[0])
+        return drawn.astype(np.float32), (drawn,)
+
+
+@pytest.mark.parametrize("mode", [None, "model_1"])
+def test_members_keep_what_they_drew_for_an_episode(mode):
+    union = Union([Wavers(**vars(walker(0.0)), within=within) for within in ((0.0, 0.5), (0.5, 1.0))])
+    obs = np.zeros((40, 2), dtype=np.float32)
+    rng = np.random.default_rng(0)
+    actions, state = union.predict(obs, episode_start=np.ones(40, dtype=bool), mode=mode)
+    for _ in range(20):
+        starts = rng.random(40) < 0.2
+        following, state = union.predict(obs, state, starts, mode=mode)
+        np.testing.assert_array_equal(following == actions, ~starts[:, None])
+        actions = following
+    assert (actions > 0.5).all() if mode else set(actions[:, 0] > 0.5) == {True, False}
+
+
+def test_a_union_of_models_with_modes_or_latents_follows_them():
+    for algorithm, policy in ((RPG, "MlpPolicy"), (DDiffPG, "DiffusionPolicy")):
+        models = [algorithm(policy, DummyVecEnv([TwoEnds]), seed=seed) for seed in range(2)]
+        if algorithm is DDiffPG:
+            for model in models:
+                model._expect_unknown_modes(3)
+        union, obs = Union(models), np.zeros((30, 2), dtype=np.float32)
+        _, (acting, states) = union.predict(obs, episode_start=np.ones(30, dtype=bool))
+        _, (later, followed) = union.predict(obs, (acting, states), np.zeros(30, dtype=bool))
+        np.testing.assert_array_equal(acting, later)
+        for before, after in zip(states, followed, strict=True):
+            np.testing.assert_array_equal(before[0], after[0])
+            assert len(np.unique(before[0])) > 1
+
+
 def test_bad_unions():
     with pytest.raises(ValueError, match="models: none"):
         Union([])
@@ -64,3 +105,9 @@ def test_bad_unions():
         Union([walker(1.0), other])
     with pytest.raises(ValueError, match="model_0"):
         Union([walker(1.0)]).predict(np.zeros((1, 2)), mode="model_7")
+    for lone in (np.zeros(2), {"a": np.zeros(2)}):
+        with pytest.raises(ValueError, match="observation: shape"):
+            union = Union([walker(1.0)])
+            if isinstance(lone, dict):
+                union.models[0].observation_space = spaces.Dict({"a": TwoEnds().observation_space})
+            union.predict(lone)

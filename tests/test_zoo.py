@@ -231,15 +231,22 @@ def test_sampled_hyperparameters_are_accepted(algo):
 
 
 @pytest.mark.parametrize("algo", BASELINES)
-def test_baselines_in_the_zoo(tmp_path, algo, capsys):
+def test_baselines_in_the_zoo(tmp_path, algo, capsys, monkeypatch):
     settings = {"learning_starts": 40, "batch_size": 16, "buffer_size": 2000, "n_envs": 4, "policy_kwargs": {"net_arch": [16]}}
     options = ["--algo", algo, "--env", ENV, "-f", str(tmp_path)]
     hyper = ["--hyperparams", *(f"{key}:{value!r}" for key, value in settings.items())]
     main(["train", *options, "-n", "200", "--eval-freq", "100", "--eval-episodes", "2", *hyper])
     config = yaml.unsafe_load((tmp_path / algo / f"{ENV}_1" / ENV / "config.yml").read_text())
     assert (config["n_steps"], config["reward_scale"]) == (3, 5)
+    drawn, predict = set(), ALGOS[algo].predict
+
+    def spy(self, *args, **kwargs):
+        drawn.add(not kwargs["deterministic"])
+        return predict(self, *args, **kwargs)
+
+    monkeypatch.setattr(ALGOS[algo], "predict", spy)
     main(["enjoy", *options, "--no-render", "-n", "160"])
-    assert "observed mode" in capsys.readouterr().out
+    assert "observed mode" in capsys.readouterr().out and drawn == {True}
 
 
 def test_tracking_needs_nothing_of_ours(tmp_path, monkeypatch):

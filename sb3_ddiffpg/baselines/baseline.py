@@ -6,10 +6,10 @@ from typing import Any, ClassVar
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sb3_ddiffpg.actor_critic import NoveltyActorCritic
 from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
+from sb3_ddiffpg.policy_parts import average_networks
 from sb3_ddiffpg.trajectories import Trajectory
 from sb3_ddiffpg.twin_critic_policy import Actor, TwinCriticPolicy
 
@@ -89,20 +89,24 @@ class Baseline(NoveltyActorCritic):
         super().__init__(policy, env, **kwargs)
 
     def _next_actions(self, batch: ModeBatch) -> tuple[th.Tensor, th.Tensor | float]:
-        actor = self.actor if self.actor_tau is None else self.policy.actor_target
-        return actor(batch.next_observations), 0.0
+        return self._target_actor()(batch.next_observations), 0.0
+
+    def _target_actor(self) -> Any:
+        return self.actor if self.actor_tau is None else self.policy.actor_target
 
     def _update_targets(self) -> None:
         super()._update_targets()
         if self.actor_tau is not None:
             self._average_actor(self.actor_tau)
 
+    def _end_updates(self, gradient_steps: int, metrics: dict[str, list[th.Tensor]]) -> None:
+        super()._end_updates(gradient_steps, metrics)
+        if self.actor_tau is None:  # it may be given when the model goes on
+            average_networks([self.actor], [self.policy.actor_target], 1.0)
+
     def _average_actor(self, tau: float) -> None:
         """Let the target actor follow the actor."""
-        actor, target = self.actor, self.policy.actor_target
-        get_ema_multi_avg_fn(1 - tau)(list(target.parameters()), list(actor.parameters()), None)
-        for current, average in zip(actor.buffers(), target.buffers(), strict=True):
-            average.copy_(current)
+        average_networks([self.actor], [self.policy.actor_target], tau)
 
     def _step_actor(self, loss: th.Tensor) -> th.Tensor:
         """One step of the actor's optimiser; gives the loss back."""

@@ -50,7 +50,7 @@ class ConsistencyActor(Actor):
         self.network = Denoiser(
             features_dim, get_action_dim(action_space), n_diffusion_steps, net_arch, activation_fn, time_embedding_dim
         )
-        self.register_buffer("sigmas", th.linspace(2.0, SIGMA_MAX, n_diffusion_steps).flip(0), persistent=False)
+        self.register_buffer("sigmas", th.linspace(SIGMA_MAX, 2.0, n_diffusion_steps), persistent=False)
 
     def consistency(self, actions: th.Tensor, condition_part: th.Tensor, sigma: th.Tensor) -> th.Tensor:
         """
@@ -131,7 +131,7 @@ class ConsistencyAC(Baseline):
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param n_diffusion_steps: Evaluations of the network for one action
     :param consistency_coef: Factor of the consistency loss
-    :param n_levels: Noise levels of the consistency loss at the beginning and at the end of the training
+    :param n_levels: Noise levels of the consistency loss at the beginning of the training, and one less than at its end
     :param actor_tau: Soft update coefficient of the target actor
     :param kwargs: Of ``Baseline`` and ``NoveltyActorCritic``
     """
@@ -172,7 +172,7 @@ class ConsistencyAC(Baseline):
         actions, noise = batch.actions[0], th.randn_like(batch.actions[0])
         level = th.randint(n_levels - 1, (len(actions),), device=actions.device)
         low, high = (karras_sigmas(step, n_levels) for step in (level, level + 1))
-        online, target = self.actor, self.policy.actor_target
+        online, target = self.actor, self._target_actor()
 
         def clean(actor: Any, sigma: th.Tensor) -> th.Tensor:
             features = actor.features(batch.observations)

@@ -33,6 +33,7 @@ class DiffusionQL(Baseline):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(DiffusionActorPolicy)
     target_networks: ClassVar[dict[str, str]] = {"actor_target": "actor"}  # it acts by the target critics
+    _counters: ClassVar[dict[str, Any]] = {"_n_actor_updates": int}
 
     def __init__(
         self,

@@ -71,7 +71,8 @@ class DIPO(Baseline):
     :param action_lr: Step size of the ascent on target actions
     :param n_action_gradient_steps: Number of ascent steps K per update
     :param action_optimizer: See ``target_actions.ascend``
-    :param total_gradient_ratio: Largest norm of a whole batch's gradient, as a multiple of the action's size; None: no limit
+    :param total_gradient_ratio: Largest norm of a whole batch's gradient, as a multiple of the action's size; None: no limit.
+        With "adam", whose steps hardly depend on the gradient's size, it changes little, in the original too
     :param own_policy_batch: Whether the policy learns from a batch of its own
     :param kwargs: Of ``Baseline`` and ``NoveltyActorCritic``
     """

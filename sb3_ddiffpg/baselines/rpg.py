@@ -17,13 +17,13 @@ from stable_baselines3.common.torch_layers import (
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 from torch.nn import functional as F
-from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sb3_ddiffpg.actor_critic import CUT_VALUES
 from sb3_ddiffpg.baselines.baseline import FifoReplayBuffer, names_of
 from sb3_ddiffpg.baselines.entropy_tuning import EntropyTuning
 from sb3_ddiffpg.baselines.sac_c51 import GaussianActor
 from sb3_ddiffpg.baselines.world_model import WorldModel
+from sb3_ddiffpg.policy_parts import SavablePolicy, average_networks
 from sb3_ddiffpg.safe_files import check_array, convert
 from sb3_ddiffpg.twin_critic_policy import default_extractor
 
@@ -83,7 +83,7 @@ class LatentInference(nn.Module):
         return (posterior.log_prob(latents) - prior.log_prob(latents)).sum(dim=1)
 
 
-class RPGPolicy(BasePolicy):
+class RPGPolicy(SavablePolicy):
     """
     An actor pi(a | s, z), the model in which it is improved, and the inference of z.
 
@@ -92,7 +92,7 @@ class RPGPolicy(BasePolicy):
     :param lr_schedule: Learning rate of the actor
     :param net_arch: Hidden layers, a list or ``dict(pi=[...], qf=[...])``; ``qf`` are the model's
     :param activation_fn: Activation of all networks
-    :param features_extractor_class: Features extractor; scales bounded observations when None, combines dict observations
+    :param features_extractor_class: Features extractor; when None, observations are flattened, and those of a dict combined
     :param features_extractor_kwargs: Its keyword arguments
     :param normalize_images: Whether images are divided by 255
     :param optimizer_class: Optimiser of all networks
@@ -127,10 +127,9 @@ class RPGPolicy(BasePolicy):
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
-            squash_output=True,
             normalize_images=normalize_images,
         )
-        self._constructor: dict[str, Any] = dict(
+        self._constructor = dict(
             net_arch=net_arch,
             activation_fn=activation_fn,
             state_dim=state_dim,
@@ -169,28 +168,15 @@ class RPGPolicy(BasePolicy):
         self.inference = LatentInference(state_dim + action_dim, latent_dim, model_arch, activation_fn)
         # Tuned by the algorithm
         self.log_entropy_coef = nn.Parameter(th.zeros(()))
-        make: Any = optimizer_class
         learnt = [*self.actor.latent.parameters(), *self.inference.parameters()]
-        self.actor.optimizer = make(learnt, lr=lr_schedule(1), **self.optimizer_kwargs)
-        self.critics.optimizer = make(self.model.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+        self.actor.optimizer = self.make_optimizer(learnt, lr_schedule(1))
+        self.critics.optimizer = self.make_optimizer(self.model.parameters(), lr_schedule(1))
         self._latents_in_use: th.Tensor | None = None
 
     @property
     def critics(self) -> Any:
         """The model's values; their optimiser is that of the whole model."""
         return self.model.critics
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        data.update(
-            self._constructor,
-            lr_schedule=self._dummy_schedule,
-            optimizer_class=self.optimizer_class,
-            optimizer_kwargs=self.optimizer_kwargs,
-            features_extractor_class=self.features_extractor_class,
-            features_extractor_kwargs=self.features_extractor_kwargs,
-        )
-        return data
 
     def encode(self, obs: PyTorchObs, target: bool = False) -> th.Tensor:
         """
@@ -346,7 +332,7 @@ class RPG(EntropyTuning):
         self.state_loss_coef = state_loss_coef
         self.target_update_interval = target_update_interval
         self._n_model_updates = 0
-        self._episode_latents = np.empty((0, latent_dim), dtype=np.float32)
+        self._episode_latents = np.empty((0, 0), dtype=np.float32)
         super().__init__(
             policy,
             env,
@@ -481,10 +467,7 @@ class RPG(EntropyTuning):
     def _update_targets(self) -> None:
         self._n_model_updates += 1
         if self._n_model_updates % self.target_update_interval == 0:
-            online, target = self.policy.model, self.policy.model_target
-            get_ema_multi_avg_fn(1 - self.tau)(list(target.parameters()), list(online.parameters()), None)
-            for current, average in zip(online.buffers(), target.buffers(), strict=True):
-                average.copy_(current)
+            average_networks([self.policy.model], [self.policy.model_target], self.tau)
 
     # ------------------------------------------------------------------ acting
 

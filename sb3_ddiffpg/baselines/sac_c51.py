@@ -120,8 +120,7 @@ class SACC51(EntropyTuning, Baseline):
         )
 
     def _next_actions(self, batch: ModeBatch) -> tuple[th.Tensor, th.Tensor | float]:
-        actor = self.actor if self.actor_tau is None else self.policy.actor_target
-        actions, log_probabilities = actor.sample(batch.next_observations)
+        actions, log_probabilities = self._target_actor().sample(batch.next_observations)
         return actions, -self.entropy_coef * log_probabilities[None]
 
     def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:

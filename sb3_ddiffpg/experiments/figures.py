@@ -126,7 +126,7 @@ def ablation(runs: Sequence[Recorded], setting: str) -> Figure:
 
 def wall_clock(runs: Sequence[Recorded]) -> Figure:
     """
-    Seconds for 1000 updates and the collection between them, in the paper's four parts.
+    Seconds for 1000 updates and the collection between them, by part.
 
     :param runs: Trainings
     :return: The figure

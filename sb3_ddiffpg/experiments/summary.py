@@ -113,11 +113,11 @@ def _paper_cells(task: str, run: Recorded) -> dict[str, str | None]:
 def seconds_per_update(run: Recorded) -> float | None:
     """
     :param run: A training
-    :return: Seconds of learning for each update; None if it was not measured
+    :return: Seconds of learning for each update; None if not all of it was measured
     """
     seconds, updates = run.result.get("seconds"), run.result.get("updates")
-    if not seconds or not updates or not any(seconds[part] for part in PARTS):
-        return None  # SB3's own algorithms have no such parts
+    if not seconds or not updates or not set(PARTS) <= set(seconds):
+        return None  # records of before have no part for the rest
     return sum(seconds[part] for part in PARTS if part != "collection") / updates
 
 

@@ -1,4 +1,4 @@
-"""What a training spends its time on, in the paper's four parts."""
+"""What a training spends its time on: the paper's four parts, and what of learning belongs to none of them."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +15,7 @@ PARTS = {
     "critic": ("_update_critics", "_update_model"),
     "policy": ("_update_policy", "_update_actor"),
     "target action": ("_improve_target_actions",),
+    "other learning": ("train",),  # drawing batches, novelty, target networks
 }
 #: Tests, checkpoints and logging, in the midst of the collection
 CALLBACKS = "callbacks"

@@ -19,6 +19,7 @@ from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.checkpoints import checkpoint_files
 from sb3_ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.zoo.manager import ModeExperimentManager
@@ -208,7 +209,7 @@ def _play(script: Callable[[], Any], arguments: Sequence[str]) -> None:
         if known.algo != ALGO:
             raise SystemExit(f"--mode needs --algo {ALGO}, got {known.algo}")
         ALGOS[ALGO] = commanded_to(known.mode)
-    if known.algo == ALGO and "--deterministic" not in rest:
+    if known.algo in (ALGO, *BASELINES) and "--deterministic" not in rest:
         rest.append("--stochastic")
     try:
         # First, so that the user's own option wins
