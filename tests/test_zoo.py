@@ -25,6 +25,7 @@ from sb3_ddiffpg import DDiffPG, zoo
 from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.envs import PointMazeVecEnv
 from sb3_ddiffpg.zoo import ModeExperimentManager, check_hyperparameters, main, search
+from sb3_ddiffpg.zoo.settings import ZOO_KEYS
 
 ENV = "PointMazeV1-v0"
 # The goal is next to the start: random actions find it
@@ -309,6 +310,45 @@ def test_our_configuration(name, algo):
     assert len(ours) == 14
     assert {env_id for env_id in ours if not name.endswith("-cpu") or not env_id.startswith("Point")} <= set(entries)
     assert zoo.config_file("td3") is None
+
+
+# What the algorithms have for reasons of their own: names and networks of policies, and room for values of one sum of rewards
+OWN_SETTINGS = {"policy", "policy_kwargs", "v_max", "n_steps", "n_diffusion_steps", "replay_buffer_kwargs", "novelty_kwargs"}
+OTHER_SETTINGS = {
+    "dipo": {"action_optimizer", "action_lr", "n_action_gradient_steps"},  # not in a file for all
+    "rpg": {"n_atoms"},
+    "sac_c51": {"target_policy_noise"},
+}
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "algo"),
+    [
+        *(("ddiffpg", algo, algo) for algo in BASELINES if algo != "rpg"),
+        *(("ddiffpg-cpu", "baselines-cpu", algo) for algo in BASELINES),
+    ],
+)
+def test_baselines_are_trained_as_ddiffpg_is(ours, theirs, algo):
+    """Wherever both have a setting it is the same, also where one of them leaves it to its default."""
+    zoo.register()
+    files = [yaml.safe_load(zoo.config_file(name).read_text()) for name in (ours, theirs)]
+    defaults = [
+        {
+            name: parameter.default
+            for each in reversed(cls.__mro__)
+            if "__init__" in vars(each)
+            for name, parameter in inspect.signature(each.__init__).parameters.items()
+        }
+        for cls in (DDiffPG, ALGOS[algo])
+    ]
+    own = OWN_SETTINGS | OTHER_SETTINGS.get(algo, set())
+    for env_id in files[0].keys() & files[1].keys() - {"default"}:
+        for key in (files[0][env_id].keys() | files[1][env_id].keys()) - own:
+            if all(key in known or key in ZOO_KEYS for known in defaults):
+                first, second = (
+                    entries[env_id].get(key, known.get(key)) for entries, known in zip(files, defaults, strict=True)
+                )
+                assert first == second, (env_id, key)
 
 
 def test_a_configuration_of_ours_by_name(tmp_path):
