@@ -3,6 +3,8 @@
 import math
 import re
 from collections import defaultdict
+from functools import partial
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -177,6 +179,96 @@ def test_rewards_are_the_environments_and_what_is_new(model_free, n_steps):
     assert batch.windows.shape[-1] == n_steps
 
 
+# ------------------------------------------------------------------ how actors learn
+
+MODEL_FREE = [each for each in BASELINES.values() if each is not RPG]
+CLIMBERS = [DiffusionQL, ConsistencyAC, TD3C51, SACC51]
+
+
+def drawn_batch(model):
+    np.random.seed(0)
+    return model.replay_buffer.sample_modes(32, model.gamma, 1, 1)
+
+
+def twin_values(model, batch, actions):
+    """Each critic's, [C, n]."""
+    return model.critics.values(model.critics(model.policy.critic_features(batch.observations), actions[None]))[0]
+
+
+def loss_of(model, batch):
+    """What an update hands to the actor's optimiser, by the noise of seed 0."""
+    seen = []
+    with patch.object(model, "_step_actor", lambda loss: seen.append(loss) or loss.detach()):
+        th.manual_seed(0)
+        model._update_actor(batch, defaultdict(list))
+    return seen[0]
+
+
+@pytest.mark.parametrize("algorithm", CLIMBERS)
+def test_updates_raise_the_value_of_what_the_actor_does(algorithm):
+    model = small(algorithm, actor_tau=None)
+    model.learn(120)
+    if algorithm is SACC51:
+        with th.no_grad():
+            model.policy.log_entropy_coef.fill_(-20.0)  # entropy is worth next to nothing
+    batch = drawn_batch(model)
+
+    def worth():
+        th.manual_seed(1)
+        return twin_values(model, batch, model.actor(batch.observations)).amin(dim=0).mean().item()
+
+    before = worth()
+    for _ in range(60):
+        model._update_actor(batch, defaultdict(list))
+    assert worth() > before + 1e-3 * abs(before)
+
+
+@pytest.mark.parametrize("algorithm", [ConsistencyAC, TD3C51, SACC51])
+def test_the_smaller_of_both_values_is_climbed(algorithm):
+    model = small(algorithm, **({"initial_entropy_coef": 0.3} if algorithm is SACC51 else {}))
+    model.learn(40)
+    batch = drawn_batch(model)
+    entropy_coef = model.entropy_coef if algorithm is SACC51 else 0.0  # of before the update
+    found = loss_of(model, batch)
+    th.manual_seed(0)
+    if algorithm is SACC51:
+        actions, log_probabilities = model.actor.sample(batch.observations)
+        cost = entropy_coef * log_probabilities
+    else:
+        actions, cost = model.actor(batch.observations), th.zeros(32)
+    first, second = twin_values(model, batch, actions)
+    expected = [cost[k].item() - min(first[k].item(), second[k].item()) for k in range(32)]
+    assert found.item() == pytest.approx(np.mean(expected), rel=1e-5)
+
+
+@pytest.mark.parametrize("algorithm", MODEL_FREE)
+def test_a_target_actor_follows_and_acts_in_the_target(algorithm):
+    """As parameters by hand; without one the actor itself acts there, and the target is its copy when one is asked for."""
+    model = small(algorithm, actor_tau=0.25, **({"average_start": 0, "average_freq": 1} if algorithm is DiffusionQL else {}))
+    model.learn(60)
+    actor, target = model.actor, model.policy.actor_target
+    with th.no_grad():
+        for parameter in target.parameters():
+            parameter += 0.1 * th.randn_like(parameter)
+    expected = [0.75 * t + 0.25 * a for t, a in zip(target.parameters(), actor.parameters(), strict=True)]
+    model._update_targets()
+    for found, by_hand in zip(target.parameters(), expected, strict=True):
+        th.testing.assert_close(found, by_hand)
+    batch = drawn_batch(model)
+
+    def acts(policy):
+        th.manual_seed(0)
+        return policy(batch.next_observations)
+
+    for tau, acting in ((0.25, target), (None, actor)):
+        model.actor_tau = tau
+        th.manual_seed(0)
+        assert th.equal(model._next_actions(batch)[0], acts(acting))
+    assert not th.equal(acts(target), acts(actor))
+    model.train(1, 32)
+    assert all(th.equal(t, a) for t, a in zip(target.parameters(), actor.parameters(), strict=True))
+
+
 # ------------------------------------------------------------------ DIPO
 
 
@@ -230,6 +322,16 @@ def test_dipo_limits_the_whole_batchs_gradient():
     assert 0 < moved <= 1.01e-3
 
 
+@pytest.mark.parametrize("own", [False, True])
+def test_dipos_policy_may_learn_from_a_batch_of_its_own(own):
+    model = small(DIPO, own_policy_batch=own)
+    model.learn(60)
+    batch, stored = drawn_batch(model), []
+    model.replay_buffer.store_target_actions = lambda used, _: stored.append(used)
+    model._update_actor(batch, defaultdict(list))
+    assert (stored[0] is batch) != own and stored[0].rows.shape == batch.rows.shape
+
+
 # ------------------------------------------------------------------ Diffusion-QL
 
 
@@ -238,26 +340,62 @@ def test_variance_preserving_schedule():
     np.testing.assert_allclose(variance_preserving_betas(5), [0.196, 0.459, 0.636, 0.755, 0.835], atol=5e-4)
 
 
-def test_the_critics_gradient_reaches_the_actor_through_all_steps():
-    model = small(DiffusionQL, policy_kwargs={"net_arch": [8]}, n_diffusion_steps=4)
-    diffusion = model.actor.diffusion.double()
-    condition, noise = th.randn(6, 2).double(), th.randn(4, 6, 1).double()
-    best = th.rand(6, 1).double() - 0.5
+def test_the_critics_gradient_reaches_the_actor_through_all_steps(monkeypatch):
+    """The loss of an update against finite differences of Q(s, a), with a through the whole chain; the noise is held fixed."""
+    model = small(DiffusionQL, policy_kwargs={"net_arch": [8]}, n_diffusion_steps=4, q_coef=2.0)
+    model.learn(60)
+    model.policy.double()
+    batch = drawn_batch(model)
+    batch = batch._replace(observations=batch.observations.double())
+    monkeypatch.setattr(np.random, "permutation", lambda _: np.array([1, 0]))
+    monkeypatch.setattr(th, "randn", partial(th.randn, dtype=th.float64))
+    # Seen as they are; SB3 would make 32 bits of them
+    monkeypatch.setattr(model.actor, "features", lambda obs: obs)
+    monkeypatch.setattr(model.policy, "critic_features", lambda obs: obs[None])
 
-    def loss():
-        return (diffusion.denoise(condition, noise=noise) - best).pow(2).mean()
+    def values():
+        th.manual_seed(0)
+        return twin_values(model, batch, model.actor.diffusion.denoise(model.actor.condition(batch.observations)))
 
-    loss().backward()
-    gradients = {name: parameter.grad.clone() for name, parameter in diffusion.named_parameters()}
-    for name, parameter in diffusion.named_parameters():
+    scale = values()[0].abs().mean().item()
+    model.actor.zero_grad()
+    loss_of(model, batch).backward()
+    for name, parameter in model.actor.diffusion.named_parameters():
         place = tuple(np.random.default_rng(0).integers(size) for size in parameter.shape)
+        ends = []
+        for change in (1e-6, -1e-6):
+            with th.no_grad():
+                parameter[place] += change
+                ends.append(-2.0 * values()[1].mean().item() / (scale + 1e-6))
+                parameter[place] -= change
+        assert parameter.grad[place].item() == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-3, abs=1e-7), name
+
+
+@pytest.mark.parametrize("coin", [(0, 1), (1, 0)])
+def test_diffusion_qls_loss(monkeypatch, coin):
+    model = small(DiffusionQL, q_coef=2.0, bc_coef=0.7)
+    model.learn(60)
+    batch = drawn_batch(model)
+    monkeypatch.setattr(np.random, "permutation", lambda _: np.array(coin))
+    found = loss_of(model, batch)
+    th.manual_seed(0)
+    condition = model.actor.condition(batch.observations)
+    values = twin_values(model, batch, model.actor.diffusion.denoise(condition))
+    denoising = model.actor.diffusion.loss(batch.actions[0], condition)
+    expected = -2.0 * values[coin[0]].mean() / values[coin[1]].abs().mean() + 0.7 * denoising
+    assert found.item() == pytest.approx(expected.item(), rel=1e-4)
+
+
+def test_diffusion_qls_target_actor_waits_and_then_follows_now_and_then():
+    model = small(DiffusionQL, actor_tau=0.25, average_start=2, average_freq=3)
+    actor, target = (next(iter(part.parameters())) for part in (model.actor, model.policy.actor_target))
+    for update in range(1, 8):
         with th.no_grad():
-            parameter[place] += 1e-6
-            above = loss()
-            parameter[place] -= 2e-6
-            numeric = (above - loss()) / 2e-6
-            parameter[place] += 1e-6
-        assert gradients[name][place].item() == pytest.approx(numeric.item(), rel=1e-3, abs=1e-8), name
+            actor += 1.0
+        before = target.clone()
+        model._update_targets()
+        share = 1.0 if update <= 2 else 0.25 if update in (3, 6) else 0.0
+        th.testing.assert_close(target, before + share * (actor - before))
 
 
 def test_candidates_are_drawn_by_value(monkeypatch):
@@ -282,6 +420,29 @@ def test_an_action_of_the_smallest_noise_level_stays_as_it_is():
     th.testing.assert_close(actor.consistency(actions, part, th.full((7,), SIGMA_MIN)), actions)
     # and of the largest, nearly nothing of it is left
     assert (actor.consistency(SIGMA_MAX * actions, part, th.full((7,), SIGMA_MAX)) - actions).abs().min() > 1e-4
+
+
+@pytest.mark.parametrize("n_steps", [1, 2, 5])
+def test_sampling_begins_at_the_largest_noise_level(n_steps):
+    model = small(ConsistencyAC, n_diffusion_steps=n_steps)
+    actor, obs = model.actor, th.rand(500, 2)
+    np.testing.assert_allclose(actor.sigmas, [SIGMA_MAX - k * (SIGMA_MAX - 2) / max(n_steps - 1, 1) for k in range(n_steps)])
+    if n_steps == 1:
+        th.manual_seed(0)
+        actions = actor(obs)
+        th.manual_seed(0)
+        part = actor.network.condition_in(actor.features(obs))
+        expected = actor.consistency(SIGMA_MAX * th.randn(500, 1), part, th.full((500,), SIGMA_MAX))
+        th.testing.assert_close(actions, expected.clamp(-1, 1))
+
+
+def test_without_a_target_actor_the_actor_is_its_own_aim():
+    model = small(ConsistencyAC, consistency_coef=1.0, actor_tau=None)
+    model.learn(40)
+    with th.no_grad():
+        for parameter in model.policy.actor_target.parameters():
+            parameter.fill_(th.nan)
+    assert model._consistency_loss(drawn_batch(model)).isfinite()
 
 
 def test_noise_levels_as_in_karras():

@@ -122,6 +122,68 @@ def test_updates_move_their_own_parts():
     assert all(p.requires_grad for p in policy.model.parameters())
 
 
+def losses_of(model, update):
+    """What an update hands to an optimiser, which takes no step."""
+    seen = []
+    model.divergence_watch.step = lambda _, optimizer, loss, *rest, **options: seen.append(loss.item())
+    th.manual_seed(0)
+    update()
+    th.manual_seed(0)
+    return seen[0]
+
+
+def test_the_models_loss_by_hand():
+    """Segment by segment and step by step; the target model is not the model."""
+    model = small(n_steps=3, reward_loss_coef=2.0, value_loss_coef=3.0, state_loss_coef=5.0, v_min=-1.0)
+    model.learn(200)
+    policy, metrics = model.policy, defaultdict(list)
+    with th.no_grad():
+        for parameter in policy.model_target.parameters():
+            parameter += 0.1 * th.randn_like(parameter)
+    segments = model._sample_segments(32, metrics)
+    assert segments.ended.any() and not segments.present.all()
+    found = losses_of(model, lambda: model._update_model(segments, metrics))
+    latents = policy.draw_latents(32)
+    aims = policy.encode(segments.next_observations, target=True)
+    returns = model._imagine(policy.model_target, aims, latents.repeat_interleave(3, 0))[0].clamp(-1.0, 5.0)
+    total = []
+    for k in range(32):
+        state = policy.encode(segments.observations[k : k + 1])
+        for t in range(3):
+            state, reward, end = policy.model.step(state, segments.actions[k : k + 1, t])
+            if not segments.present[k, t]:
+                continue
+            ended, likely = bool(segments.ended[k, t]), th.sigmoid(end).item()
+            values = policy.model.values(state, latents[k : k + 1])[:, 0]
+            total.append(
+                2.0 * (reward.item() - segments.rewards[k, t].item()) ** 2
+                - np.log(likely if ended else 1 - likely)
+                + 5.0 * np.mean((state - aims[3 * k + t]).detach().numpy() ** 2)
+                + (not ended) * 3.0 * ((values - returns[3 * k + t]) ** 2).sum().item()
+            )
+    assert found == pytest.approx(np.mean(total), rel=1e-4)
+
+
+def test_the_policy_climbs_its_return_and_what_is_told_becomes_likelier():
+    model = small(n_steps=3, latent_coef=0.0, initial_entropy_coef=1e-9)
+    model.learn(200)
+    policy, metrics = model.policy, defaultdict(list)
+    segments = model._sample_segments(64, metrics)
+
+    def worth():
+        th.manual_seed(1)
+        with th.no_grad():
+            states = policy.encode(segments.observations)
+            returns, _, ratios = model._imagine(policy.model, states, policy.draw_latents(64))
+        return returns.mean().item(), ratios.mean().item()
+
+    before = worth()
+    for _ in range(60):
+        model._update_policy(segments, metrics)
+    after = worth()
+    assert after[0] > before[0] and after[1] > before[1], (before, after)
+
+
 def test_segments_are_consecutive_steps_of_one_episode():
     model = small(n_steps=3, reward_scale=2.0, intrinsic_coef=0.0)
     model.learn(200)

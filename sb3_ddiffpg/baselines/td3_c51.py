@@ -59,8 +59,8 @@ class TanhActorPolicy(MlpActorPolicy):
 class TD3C51(Baseline):
     """
     TD3 (Fujimoto et al., 2018, https://arxiv.org/abs/1802.09477) with C51 critics and NovelD. As in the DDiffPG paper's
-    comparison the actor climbs the smaller of both critics at every update; ``n_atoms=1, policy_delay=2, actor_tau=0.005,
-    intrinsic_coef=0`` are TD3's own.
+    comparison the actor climbs the smaller of both critics at every update. What else differs from TD3, and by which arguments
+    it need not, is listed in ``docs/baselines.md``.
 
     :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
