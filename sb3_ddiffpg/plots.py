@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import EngFormatter
 from scipy.cluster import hierarchy
 from scipy.spatial.distance import squareform
@@ -17,8 +18,10 @@ from sb3_ddiffpg.modes import Mode
 from sb3_ddiffpg.trajectories import NO_MODE
 from sb3_ddiffpg.visits import VisitMap
 
-#: More visits of a cell than this are shown like so many, or the start would outshine the rest
-MAX_DENSITY = 100
+# Share of the cells whose visits have a colour of their own; the rest, near the start, would outshine them
+_TOLD_APART = 0.95
+# Words stay legible over whatever colour
+_OUTLINE = [withStroke(linewidth=2, foreground="w")]
 
 
 def mode_color(number: int) -> str:
@@ -57,10 +60,11 @@ def _empty(text: str) -> Figure:
 def _draw_maze(axes: Any, maze: Any) -> None:
     axes.imshow(maze.walls, extent=maze.extent, cmap="Greys", vmin=0, vmax=1.6, zorder=0)
     axes.plot(*maze.start, marker="s", color="tab:gray", markersize=9, zorder=3)
-    axes.annotate("start", maze.start, xytext=(0, -12), textcoords="offset points", ha="center", fontsize=8, zorder=4)
+    words: dict[str, Any] = dict(textcoords="offset points", ha="center", fontsize=8, zorder=4, path_effects=_OUTLINE)
+    axes.annotate("start", maze.start, xytext=(0, -14), **words)
     for goal in maze.goals:
-        axes.add_patch(Circle(tuple(goal), 1.0, color="gold", ec="k", zorder=1))
-        axes.annotate("goal", goal, ha="center", va="center", fontsize=8)
+        axes.add_patch(Circle(tuple(goal), 1.0, fc="gold", ec="k", zorder=1))
+        axes.annotate("goal", goal, xytext=(0, -3), **words)
 
 
 def _in_plane(positions: np.ndarray) -> np.ndarray:
@@ -164,15 +168,25 @@ def plot_dendrogram(model: Any) -> Figure:
     return figure
 
 
-def draw_visits(axes: Any, visits: VisitMap, maze: Any = None) -> Any:
+def usual_visits(visits: VisitMap) -> float:
+    """
+    :param visits: At least one
+    :return: Visits which 95 of 100 known cells do not exceed
+    """
+    return max(2.0, float(np.quantile(visits.cells()[1], _TOLD_APART)))
+
+
+def draw_visits(axes: Any, visits: VisitMap, maze: Any = None, most: float | None = None) -> Any:
     """
     Visits by cell; of three coordinates the first two.
 
     :param axes: Where
     :param visits: At least one
     :param maze: An ``envs.Maze`` that is drawn below
+    :param most: Visits from which on all are shown alike; ``usual_visits`` if None
     :return: The image, for a colour bar
     """
+    most = usual_visits(visits) if most is None else most
     centres, counts = visits.cells()
     columns = np.round(_in_plane(centres) / visits.cell_size - 0.5).astype(int)
     coarse = int(np.ptp(columns, axis=0).max()) // 1000 + 1  # a stray far away must not make a picture of a million cells
@@ -181,14 +195,12 @@ def draw_visits(axes: Any, visits: VisitMap, maze: Any = None) -> Any:
     low = columns.min(axis=0)
     density = np.zeros(columns.max(axis=0) - low + 1)
     np.add.at(density, tuple((columns - low).T), counts)
-    shown = np.where(density > 0, np.minimum(density, MAX_DENSITY), np.nan)
+    shown = np.where(density > 0, np.minimum(density, most), np.nan)
     if maze is not None:
         _draw_maze(axes, maze)
     edges = low * edge, (columns.max(axis=0) + 1) * edge
     extent = (edges[0][0], edges[1][0], edges[0][1], edges[1][1])
-    image = axes.imshow(
-        shown.T, origin="lower", extent=extent, norm=LogNorm(1, MAX_DENSITY), cmap="viridis", alpha=0.85, zorder=0.5
-    )
+    image = axes.imshow(shown.T, origin="lower", extent=extent, norm=LogNorm(1, most), cmap="viridis", alpha=0.85, zorder=0.5)
     if maze is not None:
         axes.set(xlim=maze.extent[:2], ylim=maze.extent[2:])
     _label_axes(axes)
@@ -208,7 +220,7 @@ def plot_exploration(visits: VisitMap | None, maze: Any = None) -> Figure:
     figure = _new(11, 4.6)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     image = draw_visits(left, visits, maze)
-    figure.colorbar(image, ax=left, label=f"visits (from {MAX_DENSITY} on alike)", extend="max")
+    figure.colorbar(image, ax=left, label=f"visits (from {usual_visits(visits):.3g} on alike)", extend="max")
     right.plot(*np.array(visits.coverage or [(0, 0)]).T)
     _count_steps(right)
     right.set(ylabel=f"known cells of {visits.cell_size:g} m", ylim=(0, None))

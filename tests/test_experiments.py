@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.callbacks import EvaluateModesCallback
 from sb3_ddiffpg.experiments import __main__ as cli
+from sb3_ddiffpg.experiments import machine
 from sb3_ddiffpg.experiments.curve import Clock, CurveCallback
 from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 
@@ -161,12 +162,16 @@ def test_settings_that_do_not_exist(monkeypatch, tmp_path, capsys):
         ((*point, "--settings", "{gamma: 1}", "--override", "{gamma: 1}"), "one or the other"),
         ((*point, "--members", "0"), "members: 0 given"),
         (("--again", str(tmp_path), "--seed", "5"), "--again: given beside seed"),
+        ((*point, "--override", "{n_envs: 0}"), "n_envs: 0 given"),
+        ((*point, "--override", "{n_timesteps: true}"), "n_timesteps: True given"),
+        ((*point, "--override", "{env_kwargs: {maze: V9}}"), "PointMazeV1-v0 cannot be made with env_kwargs maze: V9"),
+        ((*point, "--override", "{gamma: 0.5, gamma: 0.9}"), "'gamma' stands twice"),
     ):
         with pytest.raises(SystemExit) as ended:
             record(monkeypatch, tmp_path / "run", *arguments)
         assert ended.value.code == 2
         assert re.search(said, capsys.readouterr().err, re.DOTALL), said
-    for tests in ("{n_episodes: 0}", "{episodes: 1}", "{also: [Nowhere-v0]}"):
+    for tests in ("{n_episodes: 0}", "{episodes: 1}", "{also: [Nowhere-v0]}", "{also: [AntMazeV1-v0]}"):
         with pytest.raises(SystemExit):
             cli.main(["trial", *point, "--tests", tests, "--out", str(tmp_path / "run")])
     assert not list(tmp_path.iterdir())
@@ -218,7 +223,7 @@ def test_a_trial_ends_with_the_process_that_started_it(tmp_path):
     assert list((tmp_path / "logs" / "checkpoints").glob("*.safetensors"))
 
 
-def test_settings_are_looked_at_again_under_the_lock(monkeypatch, tmp_path):
+def test_settings_are_looked_at_again_under_the_lock(monkeypatch, tmp_path, capsys):
     """Two processes want one folder: the one that waited must not take the other's training for its own."""
 
     class LateLock(FileLock):
@@ -228,6 +233,35 @@ def test_settings_are_looked_at_again_under_the_lock(monkeypatch, tmp_path):
             return super().__enter__()
 
     monkeypatch.setattr("sb3_ddiffpg.experiments.training.FileLock", LateLock)
-    with pytest.raises(ValueError, match="holds another training"):
+    with pytest.raises(SystemExit) as ended:
         record(monkeypatch, tmp_path, "--env", "PointMazeV1-v0", "--seed", "1", "--override", SMALL)
+    assert ended.value.code == 2 and "holds another training" in capsys.readouterr().err
     assert not (tmp_path / "model.zip").exists()
+
+
+def test_what_goes_on_says_with_what_it_was_begun(monkeypatch, tmp_path):
+    """A training that another commit goes on with is of both."""
+    arguments = ("--env", "PointMazeV1-v0", "--algo", "td3_c51", "--override", SMALL)
+    monkeypatch.setattr("sb3_ddiffpg.experiments.record.git_commit", lambda: "first")
+    whole = record(monkeypatch, tmp_path, *arguments)
+    assert "resumed" not in whole
+    begun = {**{name: value for name, value in whole.items() if name != "result"}, "started": "long ago"}
+    (tmp_path / "config.yml").write_text(yaml.safe_dump(begun))
+    monkeypatch.setattr("sb3_ddiffpg.experiments.record.git_commit", lambda: "second")
+    done = record(monkeypatch, tmp_path, *arguments)
+    assert (done["started"], done["git_commit"]) == ("long ago", "first") and done["result"]["complete"]
+    (resumed,) = done["resumed"]
+    assert resumed["git_commit"] == "second" and resumed["started"] > "2020" and "versions" not in resumed
+
+
+def test_the_commit_is_of_this_packages_checkout(monkeypatch, tmp_path):
+    """Not of one into which it was installed, and which ignores it."""
+    assert re.fullmatch(r"[0-9a-f]{7,}(-dirty)?", machine.git_commit())
+    subprocess.run(["git", "init", "-q", tmp_path], check=True)
+    commit = ["git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-q", "--allow-empty", "-m", "a"]
+    subprocess.run(commit, check=True)
+    installed = tmp_path / "venv" / "machine.py"
+    installed.parent.mkdir()
+    installed.touch()
+    monkeypatch.setattr(machine, "__file__", str(installed))
+    assert machine.git_commit() is None

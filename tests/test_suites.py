@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from filelock import FileLock
 
 from sb3_ddiffpg.experiments import __main__ as cli
 from sb3_ddiffpg.experiments import execution
@@ -104,7 +105,13 @@ def test_every_suite_of_the_package_can_be_run(name):
         (("PointMazeV1-v0", "PointMazeV9-v0"), "PointMazeV9-v0"),
         (("n_tests: 2", "n_tests: 0"), "n_tests"),
         (("seeds: [0]", "also: {AntMazeV1-v0: []}\nseeds: [0]"), "AntMazeV1-v0"),
-        (("variants:", "variants: ["), "is none"),
+        (("variants:", "variants: ["), "is no YAML"),
+        (("seeds: [0]", "seeds: [0]\nseeds: [1]"), "'seeds' stands twice"),
+        (("td3_c51, wide", "ddiffpg"), "'ddiffpg' stands twice"),
+        (("td3_c51, wide", "wide "), "variant"),
+        (("{algo: td3_c51", "{algorithm: td3_c51"), "accepted are algo, conf_file, settings, members"),
+        (("seeds: [0]", "resources: {gpus: .nan}\nseeds: [0]"), "gpus"),
+        (("seeds: [0]", "also: {PointMazeV1-v0: [AntMazeV1-v0]}\nseeds: [0]"), "observations or actions are not those of"),
         (("td3_c51, wide", "../wide"), "variant"),
         (("td3_c51, wide", "a/b"), "variant"),
         (("td3_c51, wide", "a|b"), "variant"),
@@ -190,6 +197,41 @@ def test_a_process_that_dies_is_started_again(tiny, tmp_path):
     killer.join()
     assert not failed and is_complete(tmp_path / place)
     assert (tmp_path / place / "logs" / "output.log").read_text().count("Using cpu device") >= 2
+
+
+def test_what_cannot_be_is_tried_once(tiny, tmp_path, monkeypatch, capsys):
+    command = [sys.executable, "-c", "print('gamma must be'); raise SystemExit(2)"]
+    monkeypatch.setattr(execution, "command_of", lambda *_: command)
+    with pytest.raises(SystemExit, match="trials failed"):
+        cli.main(["run", str(tiny), "--out", str(tmp_path), "--workers", "1", "--retries", "2", "--no-report"])
+    for path in tmp_path.glob("*/*/*/logs/output.log"):
+        assert path.read_text().count("gamma must be") == 1
+    assert "ended with code 2: gamma must be" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_two_runs_do_not_share_a_folder(tiny, tmp_path, capsys):
+    with FileLock(tmp_path / ".lock"), pytest.raises(SystemExit) as ended:
+        cli.main(["run", str(tiny), "--out", str(tmp_path), "--no-report"])
+    assert ended.value.code == 2 and "another run is at work" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*/*"))
+
+
+@pytest.mark.parametrize("command", ["run", "trial", "report"])
+def test_a_file_is_no_folder(tiny, tmp_path, capsys, command):
+    (tmp_path / "file").touch()
+    rest = {"run": [str(tiny), "--list"], "trial": ["--env", "PointMazeV1-v0"], "report": [str(tmp_path)]}[command]
+    for place in ("file", "file/below"):
+        with pytest.raises(SystemExit) as ended:
+            cli.main([command, *rest, "--out", str(tmp_path / place)])
+        assert ended.value.code == 2 and "is no folder; accepted is a folder" in capsys.readouterr().err
+
+
+def test_what_lost_its_evaluation_is_not_complete(tmp_path):
+    record = {"algo": "ddiffpg", "env": "PointMazeV1-v0", "seed": 0, "hyperparams": {}, "result": {"complete": True}}
+    (tmp_path / "config.yml").write_text(yaml.safe_dump(record))
+    assert not is_complete(tmp_path)
+    (tmp_path / "evaluation.json").touch()
+    assert is_complete(tmp_path)
 
 
 def test_what_fails_is_named_and_the_others_go_on(tiny, tmp_path, monkeypatch, capsys):

@@ -2,7 +2,10 @@
 
 import argparse
 import importlib
+import traceback
 from collections.abc import Sequence
+
+from sb3_ddiffpg.experiments.execution import REFUSED
 
 COMMANDS = {
     "run": "run a suite, or what is missing of it, and write its report",
@@ -33,7 +36,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         work = module.prepare(given)
     except ValueError as error:
         own.error(str(error))
-    work()
+    try:
+        work()
+    except (ValueError, ImportError, OSError) as error:
+        if known.command == "trial":  # where it may come from the depths of somebody's environment
+            traceback.print_exc()
+        own.exit(REFUSED, f"{own.prog}: error: {error}\n")
 
 
 if __name__ == "__main__":

@@ -12,12 +12,18 @@ from sb3_ddiffpg.experiments.record import command_line
 from sb3_ddiffpg.experiments.suite import Resources
 from sb3_ddiffpg.experiments.trial import Trial
 
+# Exit code of a command that cannot do what it was asked for, as argparse has it
+REFUSED = 2
 # Every library that would otherwise take all cores
 _THREAD_LIMITS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 class TrialFailed(Exception):
     """A trial's process ended otherwise than by having done its work."""
+
+
+class TrialRefused(Exception):
+    """A trial cannot be what it was asked to be: another attempt would end alike."""
 
 
 class Executor(Protocol):
@@ -28,7 +34,7 @@ class Executor(Protocol):
         :param trial: What to run
         :param folder: Where its record goes
         :param resources: What it takes
-        :return: Done when the trial is, with a ``TrialFailed`` if it failed after all attempts
+        :return: Done when the trial is, with a ``TrialFailed`` if it failed after all attempts, or a ``TrialRefused``
         """
 
     def stop(self) -> None:
@@ -51,6 +57,7 @@ def run_process(command: list[str], folder: Path, threads: int, running: "set[su
     :param threads: That it may use
     :param running: Holds the process while it runs
     :raises TrialFailed: If it fails
+    :raises TrialRefused: If it says, by its exit code, that it cannot be
     """
     (folder / "logs").mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, **{name: str(threads) for name in _THREAD_LIMITS}}
@@ -71,7 +78,14 @@ def run_process(command: list[str], folder: Path, threads: int, running: "set[su
         if running is not None:
             running.discard(process)
     if code != 0:
-        raise TrialFailed(f"ended with {'signal ' + str(-code) if code < 0 else 'code ' + str(code)}: see {log.name}")
+        how = f"signal {-code}" if code < 0 else f"code {code}"
+        kind = TrialRefused if code == REFUSED else TrialFailed
+        raise kind(f"ended with {how}: {_last_line(Path(log.name))} (see {log.name})")
+
+
+def _last_line(path: Path) -> str:
+    lines = path.read_text(errors="replace").strip().splitlines()
+    return lines[-1][:300] if lines else "it said nothing"
 
 
 class LocalExecutor:

@@ -11,7 +11,7 @@ from matplotlib.ticker import EngFormatter
 
 from sb3_ddiffpg import plots
 from sb3_ddiffpg.actor_critic import NoveltyActorCritic
-from sb3_ddiffpg.envs import make_vec_env
+from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.experiments.store import Recorded, by, task_of, variant_of
 from sb3_ddiffpg.experiments.summary import MEASURES, over_tasks, seconds_per_update
 from sb3_ddiffpg.experiments.wall_clock import PARTS
@@ -51,19 +51,20 @@ def curves(runs: Sequence[Recorded], measure: str, against: str = "step") -> Fig
     known = [run for run in runs if measure in run.curve and run.curve[measure].notna().any()]
     colors = palette(runs)
     apart = len(colors) > _MOST_LINES
-    shown: list[tuple[str, pd.DataFrame, pd.DataFrame | None]] = []
+    shown: list[tuple[str, pd.DataFrame, list[pd.Series]]] = []
     for task, own in by(task_of, known).items():
         table = pd.concat([_interpolated(each, measure, against) for each in by(variant_of, own).values()], ignore_index=True)
         if apart:
-            means = table.groupby(["variant", against])[measure].mean().unstack(0)
+            means = [data.groupby(against)[measure].mean() for _, data in table.groupby("variant")]
             shown += [(f"{variant}\n{task}", data, means) for variant, data in table.groupby("variant", sort=False)]
         else:
-            shown.append((task, table, None))
+            shown.append((task, table, []))
     figure, panels = _panels(len(shown))
     for axes, (title, data, behind) in zip(panels, shown, strict=True):
-        if behind is not None:
-            axes.plot(behind.index, behind, color="0.85", linewidth=0.8)
-        sns.lineplot(data, x=against, y=measure, hue="variant", palette=colors, ax=axes, errorbar=("pi", 100), legend=False)
+        for line in behind:
+            axes.plot(line.index, line, color="0.85", linewidth=0.8)
+        hues = dict.fromkeys(colors, "C0") if apart else colors  # alone in its panel
+        sns.lineplot(data, x=against, y=measure, hue="variant", palette=hues, ax=axes, errorbar=("pi", 100), legend=False)
         axes.set(title=title, xlabel={"step": "environment steps"}.get(against, against), ylabel=_LABELS.get(measure, measure))
         axes.set_ylim(0, 1.03 if measure == "success_rate" else None)
         if against == "step":
@@ -98,7 +99,8 @@ def aggregate(runs: Sequence[Recorded], measures: Sequence[str] = ("success", "c
     panels = figure.subplots(1, len(measures), sharey=True, squeeze=False)[0]
     for axes, measure in zip(panels, measures, strict=True):
         for variant, (mean, low, high) in reversed(over_tasks(runs, measure).items()):
-            axes.barh(variant, high - low, left=low, color=colors[variant], alpha=0.6, height=0.6)
+            if high > low:
+                axes.barh(variant, high - low, left=low, color=colors[variant], alpha=0.6, height=0.6)
             axes.plot([mean, mean], [variant, variant], marker="|", markersize=14, color="k")
         axes.set(title=f"{measure}: interquartile mean", xlim=(0, 1.02))
     return figure
@@ -106,7 +108,7 @@ def aggregate(runs: Sequence[Recorded], measures: Sequence[str] = ("success", "c
 
 def ablation(runs: Sequence[Recorded], setting: str) -> Figure:
     """
-    What the final model comes to, over the values of a setting.
+    What the models of the tables come to, over the values of a setting.
 
     :param runs: Trainings that differ in it
     :param setting: Its name
@@ -118,7 +120,8 @@ def ablation(runs: Sequence[Recorded], setting: str) -> Figure:
         rows = [(run.trial.hyperparams[setting], MEASURES[measure](run.evaluation), task_of(run)) for run in runs]
         data = pd.DataFrame(rows, columns=[setting, measure, "task"])
         sns.lineplot(data, x=setting, y=measure, hue="task", marker="o", ax=axes, errorbar=("pi", 100))
-        axes.set(xscale="log", xticks=(values := sorted(data[setting].unique())), ylim=(0, None))
+        values = sorted(data[setting].unique())
+        axes.set(xscale="log" if values[0] > 0 else "linear", ylim=(0, None))
         axes.set_xticks(values, [f"{value:g}" for value in values])
         axes.minorticks_off()
     return figure
@@ -163,11 +166,14 @@ class Maps:
         self.models: dict[str, Any] = {
             variant: ALGOS[run.trial.algo].load(_final_model(run)) for variant, run in shown.items()
         }
-        first = runs[0]
-        env = make_vec_env(task_of(first), 1, seed=0, **first.trial.hyperparams.get("env_kwargs", {}))
-        self.maze = env.get_attr("maze", indices=0)[0] if env.has_attr("maze") else None
-        self.observation: Any = env.reset()
-        env.close()
+        self.maze: Any = None
+        self.observation: Any = None
+        settings = runs[0].trial.hyperparams
+        if is_ours(task_of(runs[0])) and not settings.get("env_wrapper"):
+            env = make_vec_env(task_of(runs[0]), 1, seed=0, **settings.get("env_kwargs", {}))
+            self.maze = env.get_attr("maze", indices=0)[0] if env.has_attr("maze") else None
+            self.observation = env.reset()
+            env.close()
 
     def exploration(self) -> Figure | None:
         """
@@ -177,10 +183,11 @@ class Maps:
         if self.maze is None or not visited:
             return None
         figure, panels = _panels(len(visited))
+        most = max(plots.usual_visits(visits) for visits in visited.values())
         for axes, (variant, visits) in zip(panels, visited.items(), strict=True):
-            image = plots.draw_visits(axes, visits, self.maze)
+            image = plots.draw_visits(axes, visits, self.maze, most)
             axes.set_title(f"{variant}: {len(visits)} cells")
-        figure.colorbar(image, ax=panels, label=f"visits (from {plots.MAX_DENSITY} on alike)", extend="max")
+        figure.colorbar(image, ax=panels, label=f"visits (from {most:.3g} on alike)", extend="max")
         return figure
 
     def values(self) -> Figure | None:
@@ -212,8 +219,8 @@ def _final_model(run: Recorded) -> Any:
 
 
 def _panels(n: int) -> tuple[Figure, list[Any]]:
-    n_columns = min(4, max(n, 1))
-    n_rows = -(-max(n, 1) // n_columns)
+    n_rows = -(-max(n, 1) // 4)
+    n_columns = -(-max(n, 1) // n_rows)
     figure = Figure(figsize=(4.4 * n_columns, 3.6 * n_rows), layout="constrained")
     grid = figure.subplots(n_rows, n_columns, squeeze=False).ravel().tolist()
     for axes in grid[n:]:

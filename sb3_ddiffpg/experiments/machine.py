@@ -9,20 +9,26 @@ from typing import Any
 
 import torch as th
 
-PACKAGES = ("sb3_ddiffpg", "stable_baselines3", "torch", "gymnasium", "mujoco", "pybullet", "numpy", "numba")
+PACKAGES = (
+    *("sb3_ddiffpg", "stable_baselines3", "rl_zoo3", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "pybullet"),
+    *("numpy", "scipy", "numba"),
+)
 
 
 def git_commit() -> str | None:
     """
     :return: The commit of this package's checkout, marked where files differ from it; None if it is installed without one
     """
-    root = Path(__file__).parents[2]
     try:
-        done = subprocess.run(
-            ["git", "-C", root, "describe", "--always", "--dirty"], capture_output=True, text=True, check=True
-        )
+        # Or it is somebody else's checkout, into which this was installed
+        _git("ls-files", "--error-unmatch", Path(__file__).name)
+        return _git("describe", "--always", "--dirty")
     except (OSError, subprocess.CalledProcessError):
         return None
+
+
+def _git(*words: str) -> str:
+    done = subprocess.run(["git", "-C", Path(__file__).parent, *words], capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
 

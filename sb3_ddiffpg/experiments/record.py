@@ -2,6 +2,7 @@
 
 import os
 import shlex
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -74,8 +75,20 @@ def check_folder(trial: Trial, folder: Path) -> None:
     :param folder: Where its record is to go
     :raises ValueError: If another training's is there
     """
-    if has_record(folder) and recorded_trial(folder) != trial:
-        raise ValueError(f"out: {folder} holds another training; accepted is a folder without one, or with this one")
+    if has_record(folder) and (other := recorded_trial(folder)) != trial:
+        differences = "; ".join(_differences(other, trial))
+        raise ValueError(
+            f"out: {folder} holds another training ({differences}); accepted is a folder without one, or with this one"
+        )
+
+
+def _differences(there: Trial, asked: Trial) -> Iterator[str]:
+    before, now = (msgspec.to_builtins(each) for each in (there, asked))
+    for part, whole in (("hyperparams", "settings"), ("tests", "tests"), (None, "")):
+        old, new = (before, now) if part is None else (before.pop(part), now.pop(part))
+        for name in sorted(old.keys() | new.keys()):
+            if old.get(name) != new.get(name):
+                yield f"{whole} {name}: {old.get(name)!r} there, {new.get(name)!r} asked for".strip()
 
 
 def is_complete(folder: Path) -> bool:
@@ -84,7 +97,9 @@ def is_complete(folder: Path) -> bool:
     :return: Whether there is nothing left to do
     :raises ValueError: If its record is damaged
     """
-    return has_record(folder) and bool((read_record(folder).get("result") or {}).get("complete"))
+    if not has_record(folder) or not (folder / "evaluation.json").is_file():
+        return False
+    return bool((read_record(folder).get("result") or {}).get("complete"))
 
 
 def command_line(trial: Trial, folder: Path) -> list[str]:
@@ -104,9 +119,9 @@ def new_record(trial: Trial, folder: Path) -> dict[str, Any]:
     """
     :param trial: What is to be trained
     :param folder: Where its record goes
-    :return: The record as it begins
+    :return: The record as it begins; where it goes on, what it was begun with, and by what it is ``resumed``
     """
-    return {
+    now: dict[str, Any] = {
         **msgspec.to_builtins(trial),
         "command": shlex.join(["python", "-m", "sb3_ddiffpg.experiments", *command_line(trial, folder)]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -114,6 +129,11 @@ def new_record(trial: Trial, folder: Path) -> dict[str, Any]:
         "machine": machine(),
         "versions": versions(),
     }
+    if not has_record(folder):
+        return now
+    begun = {name: value for name, value in read_record(folder).items() if name != "result"}
+    changed = {name: now[name] for name in ("started", "git_commit", "machine", "versions") if now[name] != begun.get(name)}
+    return {**begun, "resumed": [*begun.get("resumed", []), changed]}
 
 
 def write_record(record: dict[str, Any], folder: Path) -> None:

@@ -5,7 +5,8 @@ import base64
 import io
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sb3_ddiffpg.experiments import figures
+from sb3_ddiffpg.experiments.files import check_output
+from sb3_ddiffpg.experiments.record import command_line
 from sb3_ddiffpg.experiments.store import Recorded, by, check_alike, read_results, task_of, variant_of
 from sb3_ddiffpg.experiments.summary import elsewhere_table, task_table
 from sb3_ddiffpg.zoo import register
@@ -24,16 +27,25 @@ from sb3_ddiffpg.zoo import register
 _IMAGE = re.compile(r'src="([^":]+\.png)"')
 
 
-def make_report(results: Path, output: Path, title: str, ablation: str | None = None) -> Path:
+def make_report(
+    results: Path,
+    output: Path,
+    title: str,
+    ablation: str | None = None,
+    suite: tuple[Collection[str], Collection[str]] | None = None,
+) -> Path:
     """
     :param results: Folder in which trainings have left their records
     :param output: Folder of the report
     :param title: Of the report
     :param ablation: Setting in which the variants differ, for a figure over its values
+    :param suite: Only trainings of these tasks and variants; all if None
     :return: The page, ``report.html``; ``report.md`` and the PNG files lie beside it
     :raises ValueError: If no training is complete
     """
     runs, incomplete = read_results(results)
+    if suite is not None:
+        runs = [run for run in runs if task_of(run) in suite[0] and variant_of(run) in suite[1]]
     if not runs:
         raise ValueError(f"results: none of the {len(incomplete)} trainings in {results} is complete")
     check_alike(runs)
@@ -109,13 +121,14 @@ def _draw(drawn: _Drawn, runs: Sequence[Recorded], setting: str | None) -> None:
         scope = "variants that have every task, over tasks and seeds (as many of each task as the one with fewest has)"
         drawn.add("aggregate", f"Interquartile means of the {scope}, stratified bootstrap.", figures.aggregate(runs))
     if setting is not None:
-        drawn.add("ablation", f"The final models over {setting}.", figures.ablation(runs, setting))
+        drawn.add("ablation", f"The models of the tables over {setting}.", figures.ablation(runs, setting))
     if any(run.result.get("seconds") for run in runs):
         drawn.add("wall_clock", "Time of 1000 updates and the collection between them, by part.", figures.wall_clock(runs))
     for task, own in by(task_of, runs).items():
         maps = figures.Maps(own)
-        drawn.add(f"exploration_{task}", f"{task}: where training went (first seed).", maps.exploration())
-        drawn.add(f"values_{task}", f"{task}: what the critics expect, of DDiffPG those of the best mode.", maps.values())
+        drawn.add(f"exploration_{task}", f"{task}: where training went (first seed), by cell.", maps.exploration())
+        text = f"{task}: what the critics expect, of reward and novelty, of DDiffPG of its best mode's reward alone"
+        drawn.add(f"values_{task}", f"{text} (first seed, last model; each panel has its own scale).", maps.values())
 
 
 def _table(frame: pd.DataFrame) -> str:
@@ -124,19 +137,23 @@ def _table(frame: pd.DataFrame) -> str:
 
 
 def _machines(runs: Sequence[Recorded]) -> list[str]:
-    found = {
+    """Where, of which commit, and with what; several lines tell that not all was made alike."""
+    found = Counter(
         f"{run.record['machine']['gpu'] or run.record['machine']['processor']}, {run.record['machine']['cores']} cores, "
         f"{run.record['machine']['torch_threads']} threads each, commit {run.record['git_commit']}, "
         + ", ".join(f"{name} {version}" for name, version in run.record["versions"].items())
         for run in runs
-    }
-    return sorted(found)
+    )
+    return [f"{n} of {len(runs)} trainings: {what}" for what, n in found.most_common()]
 
 
 def _commands(runs: Sequence[Recorded]) -> dict[str, str]:
     """How the first training of each variant can be done again."""
-    again = "python -m sb3_ddiffpg.experiments trial --again"
-    return {variant: f"{again} {shlex.quote(str(own[0].folder))} --out DIR" for variant, own in by(variant_of, runs).items()}
+    found = {}
+    for variant, own in by(variant_of, runs).items():
+        words = command_line(own[0].trial, Path("DIR"))
+        found[variant] = f"python -m sb3_ddiffpg.experiments {shlex.join(words)}"
+    return found
 
 
 def _encoded(path: Path) -> str:
@@ -161,6 +178,7 @@ def prepare(given: argparse.Namespace) -> Callable[[], Any]:
     """
     register()
     output = given.out or given.results / "report"
+    check_output(output)
     title = given.title or given.results.resolve().name
     # Nothing in it runs for long: what is wrong with the results is said as what is wrong with the arguments
     return partial(print, f"wrote {make_report(given.results, output, title, given.ablation)}")

@@ -10,11 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
 from sb3_ddiffpg.experiments.execution import Executor, LocalExecutor, RayExecutor, TrialFailed
+from sb3_ddiffpg.experiments.files import check_output
 from sb3_ddiffpg.experiments.progress import read_progress
 from sb3_ddiffpg.experiments.record import check_folder, has_record, is_complete
 from sb3_ddiffpg.experiments.suite import Suite, read_suite, suite_names
@@ -162,15 +164,27 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
         value = getattr(given, name)
         if value is not None and value < least:
             raise ValueError(f"--{name}: {value} given; accepted are whole numbers from {least} up")
+    if given.workers is not None and given.ray not in (None, "local"):
+        raise ValueError(f"--workers: {given.workers} given beside --ray {given.ray}; accepted is one of both")
     folder = given.out.resolve()
+    check_output(folder)
     missing = missing_trials(suite, folder)
     print(f"{suite.description}\n{len(missing)} of {suite.n_trials} trials to run", flush=True)
     if given.list:
-        return partial(print, *missing, sep="\n")
+        return partial(print, *missing, sep="\n", end="\n" if missing else "")
     return partial(_run, given, suite, folder, bool(missing))
 
 
 def _run(given: argparse.Namespace, suite: Suite, folder: Path, missing: bool) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(folder / ".lock", blocking=False):
+            _run_alone(given, suite, folder, missing)
+    except Timeout:
+        raise ValueError(f"--out: {folder} given, where another run is at work; accepted is another folder") from None
+
+
+def _run_alone(given: argparse.Namespace, suite: Suite, folder: Path, missing: bool) -> None:
     name = Path(given.suite).stem
     if missing:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -190,4 +204,6 @@ def _run(given: argparse.Namespace, suite: Suite, folder: Path, missing: bool) -
     if not given.no_report:
         from sb3_ddiffpg.experiments.report import make_report  # needs the extra "plots"
 
-        print(f"wrote {make_report(folder, folder / 'report', title=name, ablation=suite.ablation)}")
+        # What else may lie there is no part of it; seeds that were trained before are
+        whole = read_suite(given.suite)
+        print(f"wrote {make_report(folder, folder / 'report', name, suite.ablation, (whole.tasks, whole.variants))}")

@@ -13,6 +13,9 @@ from sb3_ddiffpg.experiments.record import has_record, read_record, trial_of
 from sb3_ddiffpg.experiments.trial import Trial
 from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 
+# What reports tell of every training
+_RECORDED = ("machine", "versions", "git_commit")
+
 
 @dataclass(frozen=True)
 class Recorded:
@@ -25,6 +28,7 @@ class Recorded:
     :param curve: Its tests, one a row; empty for a union
     :param evaluation: Of the best model
     :param elsewhere: Of the same in further environments, by id
+    :param last_success: Success without command of the last model, which need not be the best; NaN where that is not known
     """
 
     folder: Path
@@ -33,6 +37,7 @@ class Recorded:
     curve: pd.DataFrame
     evaluation: ModeEvaluation
     elsewhere: dict[str, ModeEvaluation]
+    last_success: float
 
     @property
     def result(self) -> dict[str, Any]:
@@ -91,9 +96,16 @@ def _read(folder: Path, record: dict[str, Any]) -> Recorded | None:
     curve = folder / "curve.csv"
     elsewhere = sorted(folder.glob("evaluation_*.json"))
     try:
+        _check(record)
         return _of_files(folder, record, curve, elsewhere)
     except (ValueError, pd.errors.ParserError) as error:  # of an evaluation, or an empty table
         raise ValueError(f"{folder}: {error}") from None
+
+
+def _check(record: dict[str, Any]) -> None:
+    for part, of_part, names in (("", record, _RECORDED), ("result: ", record["result"], ("steps", "hours"))):
+        if missing := [name for name in names if name not in of_part]:
+            raise ValueError(f"its record has no {part}{', '.join(missing)}")
 
 
 def _of_files(folder: Path, record: dict[str, Any], curve: Path, elsewhere: list[Path]) -> Recorded:
@@ -104,7 +116,15 @@ def _of_files(folder: Path, record: dict[str, Any], curve: Path, elsewhere: list
         pd.read_csv(curve) if curve.is_file() else pd.DataFrame(),
         ModeEvaluation.load(folder / "evaluation.json"),
         {path.stem.removeprefix("evaluation_"): ModeEvaluation.load(path) for path in elsewhere},
+        _last_success(folder, record),
     )
+
+
+def _last_success(folder: Path, record: dict[str, Any]) -> float:
+    last = folder / "logs" / "evaluation_final.json"
+    is_best = record["result"].get("best_step") == record["result"]["steps"]
+    path = folder / "evaluation.json" if is_best else last
+    return ModeEvaluation.load(path).uncommanded.success_rate if path.is_file() else float("nan")
 
 
 def check_alike(runs: Sequence[Recorded]) -> None:

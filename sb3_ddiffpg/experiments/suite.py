@@ -1,14 +1,17 @@
 """Suites: tasks times variants of algorithms times seeds, declared in a YAML file."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
-import yaml
 
+from sb3_ddiffpg.experiments.files import read_yaml
 from sb3_ddiffpg.experiments.trial import Tests, Trial, hyperparameters
 from sb3_ddiffpg.zoo import ALGO
+
+T = TypeVar("T")
 
 SUITES = Path(__file__).parent / "suites"
 
@@ -130,21 +133,30 @@ def read_suite(
     path = path if path.is_file() else Path(name)
     if not path.is_file():
         raise ValueError(f"suite: {name!r} given; accepted are {', '.join(suite_names())}, or the path of a YAML file")
-    try:
-        suite = msgspec.convert(yaml.safe_load(path.read_text()), Suite)
-    except (yaml.YAMLError, msgspec.ValidationError) as error:
-        raise ValueError(f"suite: {path} is none: {error}") from None
+    said = read_yaml("suite", path)
+    variants_said = said.get("variants") if isinstance(said, dict) else None
+    for variant, of_variant in variants_said.items() if isinstance(variants_said, dict) else ():
+        _convert(of_variant, Variant, f"{path}: variant {variant!r}")
+    suite = _convert(said, Suite, str(path))
     _chosen("also", suite.tasks, list(suite.also))
     suite.tasks = _chosen("tasks", suite.tasks, tasks)
     suite.variants = _chosen("variants", suite.variants, variants)
     suite.also = {task: others for task, others in suite.also.items() if task in suite.tasks}
     suite.seeds = list(suite.seeds if seeds is None else seeds)
-    if suite.resources.cpus < 1 or suite.resources.gpus < 0:
+    if suite.resources.cpus < 1 or not 0 <= suite.resources.gpus < math.inf:
         raise ValueError(f"resources: {suite.resources} given; accepted are cpus from 1 and gpus from 0 up")
     for kind, of_kind in (("tasks", suite.tasks), ("variants", suite.variants), ("seeds", suite.seeds)):
         if not of_kind or (kind == "seeds" and len(set(suite.seeds)) < len(suite.seeds)):
             raise ValueError(f"{kind}: {list(of_kind)} given; accepted are one or more, each once")
     return suite
+
+
+def _convert(said: Any, kind: type[T], what: str) -> T:
+    try:
+        return msgspec.convert(said, kind)
+    except msgspec.ValidationError as error:
+        accepted = ", ".join(kind.__struct_fields__)  # type: ignore[attr-defined]
+        raise ValueError(f"suite: {what} is none: {error}; accepted are {accepted}") from None
 
 
 def _chosen(kind: str, known: dict[str, Any], names: Sequence[str] | None) -> dict[str, Any]:

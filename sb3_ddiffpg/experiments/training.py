@@ -25,6 +25,7 @@ from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.evaluation import evaluate_modes
 from sb3_ddiffpg.experiments.curve import CurveCallback
+from sb3_ddiffpg.experiments.files import check_output, parse_yaml
 from sb3_ddiffpg.experiments.progress import Progress, ProgressCallback, write_progress
 from sb3_ddiffpg.experiments.record import (
     check_folder,
@@ -277,6 +278,7 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
     :raises ValueError: If it asks for what there is not
     """
     register()
+    check_output(given.out)
     if (given.env is None) == (given.again is None):
         raise ValueError("--env or --again is needed, and not both")
     others = ("algo", "seed", "variant", "conf_file", "override", "settings", "members", "tests")
@@ -318,7 +320,7 @@ def _asked_for(given: argparse.Namespace) -> Trial:
 def _settings(text: str) -> dict[str, Any]:
     """Of ``--override``, ``--settings`` and ``--tests``."""
     try:
-        settings = yaml.safe_load(text)
+        settings = parse_yaml(text)
     except yaml.YAMLError as error:
         raise argparse.ArgumentTypeError(f"{text!r} is no YAML: {error}") from None
     if not isinstance(settings, dict):

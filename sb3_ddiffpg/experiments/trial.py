@@ -11,6 +11,7 @@ import gymnasium as gym
 import msgspec
 import yaml
 
+from sb3_ddiffpg.experiments.files import read_yaml
 from sb3_ddiffpg.zoo import ALGOS, check_hyperparameters, config_file, register
 
 
@@ -67,24 +68,36 @@ class Trial(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
             check_hyperparameters(self.algo, list(self.hyperparams))
         except TypeError as error:
             raise ValueError(f"settings of {self.variant} in {self.env}: {error}") from None
-        if re.fullmatch(r"\w[\w .,+=()-]{0,60}", self.variant) is None:
-            accepted = "1 to 61 letters, digits, blanks and .,+=()-_ that begin with a letter or digit"
+        if re.fullmatch(r"\w([\w .,+=()-]{0,59}[\w.,+=()-])?", self.variant) is None:
+            accepted = "1 to 61 letters, digits, blanks and .,+=()-_ that begin with a letter or digit and end with no blank"
             raise ValueError(f"variant: {self.variant!r} given; accepted are {accepted}")
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed: {self.seed} given; accepted are whole numbers from 0 to {2**31 - 1}")
-        if self.tests.also and self.members > 1:
-            raise ValueError(f"also: {self.tests.also} given beside members: {self.members}; accepted is one of both")
-        if self.hyperparams.get("normalize") and (self.tests.also or self.members > 1):
-            raise ValueError("normalize: given beside also or members, whose environments are not normalised")
+        self._check_environments()
         counts: dict[str, Any] = {"members": self.members, "n_timesteps": self.hyperparams.get("n_timesteps")}
+        counts["n_envs"] = self.hyperparams.get("n_envs", 1)
         counts |= {name: getattr(self.tests, name) for name in ("n_tests", "n_test_episodes", "n_episodes")}
         for name, value in counts.items():
-            if not isinstance(value, (int, float)) or not 1 <= value < math.inf:
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 1 <= value < math.inf:
                 raise ValueError(f"{name}: {value!r} given; accepted are numbers from 1 up")
         if counts["n_timesteps"] < self.members:
             raise ValueError(
                 f"members: {self.members} given for {counts['n_timesteps']:g} steps; accepted is one step for each"
             )
+
+    def _check_environments(self) -> None:
+        if self.tests.also and self.members > 1:
+            raise ValueError(f"also: {self.tests.also} given beside members: {self.members}; accepted is one of both")
+        for name in ("normalize", "env_wrapper", "vec_env_wrapper", "frame_stack"):
+            if self.hyperparams.get(name) and (self.tests.also or self.members > 1):
+                raise ValueError(f"{name}: given beside also or members, whose environments are tested as they are")
+        env_kwargs = self.hyperparams.get("env_kwargs", {})
+        if not isinstance(env_kwargs, dict):
+            raise ValueError(f"env_kwargs: {env_kwargs!r} given; accepted are arguments of the environment by name")
+        spaces, *others = (_spaces_of(env_id, yaml.safe_dump(env_kwargs)) for env_id in (self.env, *self.tests.also))
+        for env_id, other in zip(self.tests.also, others, strict=True):
+            if not all(map(_alike, other, spaces)):
+                raise ValueError(f"also: {env_id} given, whose observations or actions are not those of {self.env}")
 
 
 def hyperparameters(algo: str, env_id: str, conf_file: str | None, overrides: dict[str, Any]) -> dict[str, Any]:
@@ -101,7 +114,7 @@ def hyperparameters(algo: str, env_id: str, conf_file: str | None, overrides: di
         raise ValueError(f"conf-file: {conf_file!r} given for {algo!r}; accepted is a YAML file, or the name of one of ours")
     entries = _entries(path, path.stat().st_mtime_ns)
     if not isinstance(entries, dict) or not isinstance(entries.get(env_id), dict):
-        known = ", ".join(sorted(map(str, entries))) if isinstance(entries, dict) else "nothing"
+        known = ", ".join(sorted(map(str, entries.keys() - {"default", "paper"}))) if isinstance(entries, dict) else "nothing"
         raise ValueError(f"env: {env_id!r} given; {path.name} has settings for {known}")
     return {name: _number(value) for name, value in {**entries[env_id], **overrides}.items()}
 
@@ -109,10 +122,25 @@ def hyperparameters(algo: str, env_id: str, conf_file: str | None, overrides: di
 @cache
 def _entries(path: Path, changed_at: int) -> Any:
     """A suite reads the same file for every trial."""
+    return read_yaml("conf-file", path)
+
+
+def _alike(one: gym.Space, other: gym.Space) -> bool:
+    """Bounds may differ: of another maze they do."""
+    if isinstance(one, gym.spaces.Box) and isinstance(other, gym.spaces.Box):
+        return (one.shape, one.dtype) == (other.shape, other.dtype)
+    return one == other
+
+
+@cache
+def _spaces_of(env_id: str, env_kwargs: str) -> tuple[gym.Space, gym.Space]:
+    """Made once, to see that it can be."""
     try:
-        return yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"conf-file: {path} is no YAML: {error}") from None
+        env = gym.make(env_id, **yaml.safe_load(env_kwargs))
+    except Exception as error:  # whatever somebody's environment raises
+        raise ValueError(f"env: {env_id} cannot be made with env_kwargs {env_kwargs.strip()}: {error}") from None
+    env.close()
+    return env.observation_space, env.action_space
 
 
 def _number(value: Any) -> Any:
