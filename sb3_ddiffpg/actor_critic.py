@@ -3,6 +3,7 @@
 import uuid
 import warnings
 from collections import defaultdict
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -244,15 +245,16 @@ class NoveltyActorCritic(SavableAlgorithm):
         self._resolve_mode_features()
         if self._novelty_cell_size is None and self.mode_features is None:
             self._novelty_cell_size = declared_cell_size(self.env, "novelty_cell_size")
-        given = self.policy_kwargs, self.replay_buffer_kwargs, self.n_steps
+        given = self.policy_class, self.policy_kwargs, self.replay_buffer_kwargs, self.n_steps
         # Not stored in the model: what the user gave is what ``load`` compares and ``save`` keeps
+        self.policy_class = partial(self._built, "policy", self.policy_class)  # type: ignore[assignment]
         self.policy_kwargs = {**self._policy_arguments(), **self.policy_kwargs}
         self.replay_buffer_kwargs = {**self._buffer_arguments(), **self.replay_buffer_kwargs}
         self.n_steps = 1  # for more, SB3 would want a buffer of its own
         try:
             super()._setup_model()
         finally:
-            self.policy_kwargs, self.replay_buffer_kwargs, self.n_steps = given
+            self.policy_class, self.policy_kwargs, self.replay_buffer_kwargs, self.n_steps = given
         noise = self.action_noise
         if noise is None or (isinstance(noise, SpreadNormalActionNoise) and noise.shape[0] != self.n_envs):
             # None given, or loaded with another number of environments
@@ -268,9 +270,8 @@ class NoveltyActorCritic(SavableAlgorithm):
             self.env_spec = describe_env(self.env)
             self.is_normalized = self._vec_normalize_env is not None
         measure = NOVELTY_MEASURES[self.novelty] if isinstance(self.novelty, str) else self.novelty
-        self.novelty_model: Any = measure(
-            self.replay_buffer.features.dim, self.policy.actor.features_dim, **self._novelty_arguments()
-        ).to(self.device)
+        dims = self.replay_buffer.features.dim, self.policy.actor.features_dim
+        self.novelty_model: Any = self._built("novelty_model", measure, *dims, **self._novelty_arguments()).to(self.device)
         self.intrinsic_moments = RunningMoments(1, max_count=100_000).to(self.device)
         self._qf_schedule = self.lr_schedule if self.qf_learning_rate is None else FloatSchedule(self.qf_learning_rate)
         self._create_aliases()
@@ -583,8 +584,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         if new_episodes:
             self._begin_episodes()
         if self._interrupted is not None:
-            interrupted, self._interrupted = self._interrupted, None
-            interrupted.go_on(self, callback)
+            self._interrupted.go_on(self, callback)
         return total_timesteps, callback
 
     def _begin_episodes(self) -> None:
@@ -610,6 +610,7 @@ class NoveltyActorCritic(SavableAlgorithm):
         See SB3. A callback that stops the training makes SB3 drop the last transition (its issue 2056), and so does an error
         or an interrupt: the next ``learn`` then resets the environments, or the running trajectories would have a gap.
         """
+        self._interrupted = None  # callbacks may have refused to begin before
         complete = False
         try:
             rollout = super().collect_rollouts(*args, **kwargs)

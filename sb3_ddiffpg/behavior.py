@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from sb3_ddiffpg.safe_files import check_array, convert
+from sb3_ddiffpg.safe_files import Count, check_array, convert
 
 # Rows of the policy's embedding table: 0 explores, m + 1 is mode m. No row: the zero embedding.
 EXPLORATORY_GROUP = 0
@@ -17,7 +17,7 @@ class _State(msgspec.Struct, forbid_unknown_fields=True):
     explored: np.ndarray
     handed_over: np.ndarray
     may_hand_over: np.ndarray
-    n_turns: int
+    n_turns: Count
 
 
 class Behavior:
@@ -137,14 +137,15 @@ class Behavior:
         """
         return {name: getattr(self, name) for name in _State.__struct_fields__}
 
-    def load_state_dict(self, state: Any, n_modes: int) -> None:
+    def load_state_dict(self, state: Any, n_envs: int, n_modes: int) -> None:
         """
         :param state: What ``state_dict`` gave
+        :param n_envs: Number of environments
         :param n_modes: Number of modes M
         :raises ValueError: If it is something else
         """
         known = convert(state, _State, "behavior")
-        check_array(known.groups, np.int64, [None], "behavior.groups")
+        check_array(known.groups, np.int64, [n_envs], "behavior.groups")
         for name in ("explored", "handed_over", "may_hand_over"):
             check_array(getattr(known, name), bool, known.groups.shape, f"behavior.{name}")
         if len(known.groups) and not UNCONDITIONED <= known.groups.min() <= known.groups.max() <= n_modes:

@@ -9,7 +9,7 @@ import numpy as np
 from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.known_ways import Way
 from sb3_ddiffpg.row_storage import HostRows
-from sb3_ddiffpg.safe_files import check_array, convert
+from sb3_ddiffpg.safe_files import Count, check_array, convert
 from sb3_ddiffpg.trajectories import NO_MODE, RowSet, Trajectory
 
 
@@ -55,11 +55,11 @@ class _Buffer(msgspec.Struct, forbid_unknown_fields=True):
     mode_rows: list[np.ndarray]
     new_way_rows: np.ndarray
     frozen_modes: list[int]
-    n_finished: int
+    n_finished: Count
     has_signal: bool
     recent_returns: list[float]
     owner: tuple[str, list[int]]
-    n_path_points: int
+    n_path_points: Count
     feature_scale: np.ndarray | None
     last_positions: np.ndarray
     serials: np.ndarray
@@ -238,11 +238,21 @@ def _check(buffer: ModeReplayBuffer, state: _Buffer, trajectories: list[Trajecto
         "new ways that are not stored": not np.isin(state.new_way_rows, state.stored).all(),
         "frozen modes that are not there": not set(state.frozen_modes) <= set(range(n_modes)),
         "a trajectory from the future": any(each.serial >= state.n_finished for each in trajectories),
+        "a number that is not finite": not _finite(buffer, state),
         "a row that is followed by none of its rows": bool(((next_rows < -1) | (next_rows >= pos)).any()),
     }
     for problem, found in problems.items():
         if found:
             raise ValueError(f"replay buffer: there is {problem}")
+
+
+def _finite(buffer: ModeReplayBuffer, state: _Buffer) -> bool:
+    """Of rows in use, and of what was gathered from them."""
+    parts = [raw.view(dtype)[:, 0][state.stored] for raw, dtype in zip(state.parts, _row_dtypes(buffer), strict=True)]
+    numbers = [part[name] for part in parts for name in part.dtype.names or () if part[name].dtype.kind == "f"]
+    numbers += [state.running_return, state.trajectories.episode_return, state.last_positions, state.distances]
+    numbers += [np.array(state.recent_returns), *([] if state.feature_scale is None else [state.feature_scale])]
+    return all(np.isfinite(each).all() for each in numbers)
 
 
 def _can_be(way: _Way) -> bool:

@@ -1,6 +1,6 @@
 """Checkpoints of a whole run: written so that no crash loses the one before, and from which it goes on bit for bit."""
 
-import contextlib
+import copy
 import errno
 import signal
 import threading
@@ -11,6 +11,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from filelock import FileLock, Timeout
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -19,13 +21,15 @@ from stable_baselines3.common.callbacks import (
     StopTrainingOnMaxEpisodes,
     StopTrainingOnNoModelImprovement,
 )
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ddiffpg.buffer_state import buffer_state, restore_buffer
-from sb3_ddiffpg.envs.snapshots import restore_vec_env, vec_env_snapshot
+from sb3_ddiffpg.envs.snapshots import awaits_seeds, restore_vec_env, vec_env_snapshot
 from sb3_ddiffpg.model_file import model_tree
 from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
-from sb3_ddiffpg.rng import global_rng, restore_global_rng
-from sb3_ddiffpg.safe_files import convert, read, remove_unfinished, write
+from sb3_ddiffpg.rng import global_rng, preserved_rng, restore_global_rng
+from sb3_ddiffpg.safe_files import check_array, convert, read, remove_unfinished, write
 
 #: What the file says it is
 KIND = "checkpoint"
@@ -88,7 +92,7 @@ def read_checkpoint(path: str | Path) -> tuple[Path, _Checkpoint]:
     for candidate in candidates:
         try:
             return candidate, convert(read(candidate, KIND), _Checkpoint, "checkpoint")
-        except ValueError as error:
+        except (ValueError, OSError) as error:  # somebody else may have removed it meanwhile
             if candidate == candidates[-1]:
                 raise
             warnings.warn(f"{error}. Going on with the checkpoint before it")
@@ -139,6 +143,13 @@ class InterruptedRun:
         :raises ValueError: If something does not fit the model or its environments
         """
         run = self.run
+        with preserved_rng():
+            restore_global_rng(run.random)  # or it would be known only when ``learn`` has begun
+        noise = self._noise(model)
+        size = int(np.prod(model.action_space.shape))  # of one environment's, until ``learn`` makes one for each of it
+        if noise is not None and np.size(copy.deepcopy(noise)()) not in (size, size * model.n_envs):
+            raise ValueError(f"noise: of another size than {model.n_envs} actions")
+        model.load_episodes_tree(run.episodes)
         restore_buffer(model.replay_buffer, run.buffer)
         model.ep_info_buffer = deque(run.episode_infos, maxlen=model._stats_window_size)
         model.ep_success_buffer = deque(run.episode_successes, maxlen=model._stats_window_size)
@@ -146,8 +157,9 @@ class InterruptedRun:
             warnings.warn("These environments cannot be saved in the middle of an episode: new episodes begin")
             return
         restore_vec_env(model.env, run.environments)
-        model._last_obs, model._last_original_obs = _observation(run.last_obs), _observation(run.last_original_obs)
-        model._last_episode_starts = run.last_episode_starts
+        model._last_obs = _observations(run.last_obs, model, "last_obs")
+        model._last_original_obs = _observations(run.last_original_obs, model, "last_original_obs")
+        model._last_episode_starts = check_array(run.last_episode_starts, bool, [model.n_envs], "last_episode_starts")
 
     def go_on(self, model: Any, callback: BaseCallback) -> None:
         """
@@ -158,8 +170,7 @@ class InterruptedRun:
         run = self.run
         if run.environments is not None:
             model.load_episodes_tree(run.episodes)
-        with contextlib.suppress(NeededError):  # one's own kind: custom_objects had it
-            model.action_noise = from_plain(run.noise)
+        model.action_noise = self._noise(model)
         known = [(each.kind, each.state) for each in run.callbacks]
         for each in nested_callbacks(callback):
             match = next((i for i, (kind, _) in enumerate(known) if kind == type(each).__name__), None)
@@ -167,11 +178,31 @@ class InterruptedRun:
                 _load_callback_state(each, known.pop(match)[1])
         restore_global_rng(run.random)
 
+    def _noise(self, model: Any) -> ActionNoise | None:
+        try:
+            noise = from_plain(copy.deepcopy(self.run.noise))  # it changes its arrays
+        except NeededError:  # one's own kind: custom_objects had it
+            return model.action_noise
+        if noise is not None and not isinstance(noise, ActionNoise):
+            raise ValueError(f"noise: {str(noise)[:100]!r} is none")
+        return noise
 
-def _observation(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: convert(each, np.ndarray, f"last_obs.{key}") for key, each in value.items()}
-    return None if value is None else convert(value, np.ndarray, "last_obs")
+
+def _observations(value: Any, model: Any, what: str) -> Any:
+    """Of all environments, as the model sees them."""
+    if value is None:
+        return None
+    space = model.observation_space
+    parts = {f"{what}.{key}": each for key, each in space.spaces.items()} if isinstance(space, spaces.Dict) else {what: space}
+    given = {f"{what}.{key}": each for key, each in value.items()} if isinstance(value, dict) else {what: value}
+    if set(given) != set(parts):
+        raise ValueError(f"{what}: {sorted(given)} given; accepted are {sorted(parts)}")
+    for name, each in parts.items():
+        array = convert(given[name], np.ndarray, name)
+        check_array(array, array.dtype, [model.n_envs, *(each.shape or ())], name)
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name}: there are numbers that are not finite")
+    return value
 
 
 def nested_callbacks(callback: BaseCallback | None) -> list[BaseCallback]:
@@ -193,6 +224,8 @@ def _gathered(callback: BaseCallback) -> list[str]:
 
 def _callback_state(callback: BaseCallback) -> dict[str, Any]:
     state: dict[str, Any] = {"n_calls": callback.n_calls}
+    if isinstance(tests := getattr(callback, "eval_env", None), VecEnv) and not awaits_seeds(tests):
+        state["eval_env"] = vec_env_snapshot(tests)  # so that further tests draw as they would have
     state.update({name: getattr(callback, name) for name in _gathered(callback)})
     if hasattr(callback, "state_dict"):
         state["own"] = callback.state_dict()
@@ -206,22 +239,38 @@ def _load_callback_state(callback: BaseCallback, state: dict[str, Any]) -> None:
         if isinstance(value, list) is not isinstance(getattr(callback, name), list):
             raise ValueError(f"callback.{name}: {str(value)[:100]} given, where {getattr(callback, name)!r} was")
         setattr(callback, name, value)
+    if isinstance(tests := getattr(callback, "eval_env", None), VecEnv) and state.get("eval_env") is not None:
+        restore_vec_env(tests, state["eval_env"])
     if hasattr(callback, "load_state_dict") and "own" in state:
         callback.load_state_dict(state["own"])
 
 
-def _refuse_another_run(folder: Path, run_id: str) -> None:
-    """What has come furthest is the newest, so that a second run in a folder would be lost beside a longer first one."""
+def _refuse_another_run(folder: Path, run_id: str, n_steps: int) -> None:
+    """
+    What has come furthest is the newest, so that a second run in a folder would be lost beside a longer first one, and so
+    would one that goes on from an older checkpoint.
+    """
     for path in checkpoint_files(folder):
         try:
             found = read_checkpoint(path)[1].model.get("state", {}).get("counters", {}).get("run_id")
-        except (ValueError, AttributeError):
+        except (ValueError, OSError, AttributeError):
             continue  # damaged, and passed over by ``resume`` too
         if found != run_id:
             raise ValueError(
                 f"folder: {folder} holds checkpoints of another run ({path.name}): resume that one, or name another folder"
             )
+        if _n_steps(path) > n_steps:
+            raise ValueError(
+                f"folder: {folder} holds a checkpoint that is further than step {n_steps} ({path.name}): resume that one, "
+                "remove it, or name another folder"
+            )
         return
+
+
+def _n_steps(path: Path) -> int:
+    """Environment steps of a checkpoint, by its name; -1 for a name that is none."""
+    digits = path.stem.removeprefix("checkpoint_")
+    return int(digits) if digits.isdecimal() else -1
 
 
 class RunCheckpointCallback(BaseCallback):
@@ -239,6 +288,7 @@ class RunCheckpointCallback(BaseCallback):
     :param keep: How many of the newest stay
     :param verbose: 1 prints a line for each
     :raises ValueError: If ``save_freq`` or ``keep`` is less than 1; when training starts, if the folder holds another run's
+        checkpoint or one that is further, or another training writes to it
     """
 
     def __init__(self, folder: str | Path, save_freq: int = 100_000, keep: int = 2, verbose: int = 0) -> None:
@@ -255,13 +305,25 @@ class RunCheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
+        self._hold_folder()
         remove_unfinished(self.folder, NAMES)
-        _refuse_another_run(self.folder, self.model.run_id)  # type: ignore[attr-defined]
+        _refuse_another_run(self.folder, self.model.run_id, self._lifetime_steps())  # type: ignore[attr-defined]
+        if vec_env_snapshot(self.training_env) is None:
+            warnings.warn("These environments cannot be saved in the middle of an episode: a run that goes on begins new ones")
         self._last, self._signal, self._stopped, self._first = self.model.num_timesteps, None, False, True
         self.all_callbacks = self.locals.get("callback", self)
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, self._note_signal)  # ``learn`` puts back what was there
+
+    def _hold_folder(self) -> None:
+        """As long as ``learn`` goes on. Two runs from one checkpoint would remove each other's."""
+        lock = FileLock(self.folder / ".lock")
+        try:
+            lock.acquire(blocking=False)
+        except Timeout:
+            raise ValueError(f"folder: another training writes its checkpoints to {self.folder}") from None
+        self.model.until_learn_ends.callback(lock.release)  # type: ignore[attr-defined]
 
     def _note_signal(self, number: int, frame: Any) -> None:
         if self._signal is not None and number == signal.SIGINT:
@@ -276,9 +338,10 @@ class RunCheckpointCallback(BaseCallback):
             try:
                 # What cannot be saved ends the training now, not in hours
                 write_checkpoint(self._path(), self.model, self.all_callbacks)
-            except OSError:
+            except OSError as error:
                 if not checkpoint_files(self.folder):
                     raise
+                self._warn_of(error)
         due = self.num_timesteps // self.save_freq > self._last // self.save_freq
         if due or self._signal is not None:
             self.save()
@@ -293,7 +356,10 @@ class RunCheckpointCallback(BaseCallback):
             self.save()
 
     def _path(self) -> Path:
-        return self.folder / f"checkpoint_{getattr(self.model, 'lifetime_steps', self.num_timesteps):012d}.safetensors"
+        return self.folder / f"checkpoint_{self._lifetime_steps():012d}.safetensors"
+
+    def _lifetime_steps(self) -> int:
+        return getattr(self.model, "lifetime_steps", self.num_timesteps)
 
     def save(self) -> bool:
         """
@@ -305,16 +371,21 @@ class RunCheckpointCallback(BaseCallback):
         try:
             write_checkpoint(path, self.model, self.all_callbacks)
         except Exception as error:  # a full disk, or what environments or callbacks have come to hold: not worth the run
-            after = "training goes on" if self._signal is None else "training ends without it"
-            what = error if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
-            warnings.warn(f"No checkpoint at step {self.num_timesteps}: {what}. The ones before stay, {after}")
+            self._warn_of(error)
             return False
-        # By age: an older run may have come further
-        others = sorted(
-            (each for each in checkpoint_files(self.folder) if each != path), key=lambda each: each.stat().st_mtime
-        )
-        for old in others[: max(0, len(others) - self.keep + 1)]:
-            old.unlink(missing_ok=True)
+        # What is further can only be damaged, or ``learn`` would not have begun
+        others = [each for each in checkpoint_files(self.folder) if each != path and _n_steps(each) >= 0]
+        further = [each for each in others if _n_steps(each) > _n_steps(path)]
+        for old in [*further, *others[len(further) :][self.keep - 1 :]]:
+            try:
+                old.unlink(missing_ok=True)
+            except OSError as error:
+                warnings.warn(f"{old} is not needed any more, and cannot be removed: {error}")
         if self.verbose >= 1:
             print(f"[checkpoint] {path}")
         return True
+
+    def _warn_of(self, error: Exception) -> None:
+        after = "training goes on" if self._signal is None else "training ends without it"
+        what = error if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        warnings.warn(f"No checkpoint at step {self.num_timesteps}: {what}. The ones before stay, {after}")

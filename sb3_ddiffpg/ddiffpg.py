@@ -25,6 +25,7 @@ from sb3_ddiffpg.intrinsic import KnownPlaces
 from sb3_ddiffpg.mode_control import ModeControl
 from sb3_ddiffpg.modes import Mode, ModeTable, Outcome, default_name, modes_from_state, modes_state
 from sb3_ddiffpg.policies import DiffusionActor, DiffusionPolicy
+from sb3_ddiffpg.safe_files import Count
 from sb3_ddiffpg.target_actions import ascend
 from sb3_ddiffpg.trajectories import NO_MODE
 from sb3_ddiffpg.validation import check_mode_arguments
@@ -150,7 +151,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     actor: DiffusionActor
     replay_buffer: ModeReplayBuffer
     _first_group = ("exploratory critics", "exploration_v_max", "intrinsic_coef")
-    _counters: ClassVar[dict[str, Any]] = {"n_rollouts": int, "_next_mode_number": int, "_steps_before": int}
+    _counters: ClassVar[dict[str, Any]] = {"n_rollouts": Count, "_next_mode_number": Count, "_steps_before": Count}
 
     def __init__(
         self,
@@ -350,6 +351,9 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     def _setup_model(self) -> None:
         super()._setup_model()
         self.known_places = KnownPlaces(self._visit_cell_size()).to(self.device)
+        dim = self.replay_buffer.features.dim
+        if any(mode.representative.shape[1] not in (0, dim) for mode in self._modes):  # of a file
+            raise ValueError(f"modes.representative: accepted are positions of {dim} components")
         self.replay_buffer.expect_modes(len(self._modes))
 
     def _create_aliases(self) -> None:
@@ -616,7 +620,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         :param tree: What ``episodes_tree`` gave
         :raises ValueError: If it is something else
         """
-        self._behavior.load_state_dict(tree, len(self._modes))
+        self._behavior.load_state_dict(tree, self.n_envs, len(self._modes))
 
     def _set_parameters(self, parameters: Any, exact_match: bool, device: th.device | str) -> None:
         """The number of modes follows; if it changes, nobody knows which modes these are: they get new names and wait."""

@@ -146,9 +146,11 @@ class DiffusionModel(nn.Module):
         self.n_steps = n_steps
         if noise_schedule not in NOISE_SCHEDULES:
             raise ValueError(f"noise_schedule must be one of {list(NOISE_SCHEDULES)}, got {noise_schedule!r}")
-        betas = NOISE_SCHEDULES[noise_schedule](n_steps)
+        with th.device("cpu"):  # wherever the networks are made
+            betas = NOISE_SCHEDULES[noise_schedule](n_steps)
+            previous = th.ones(1, dtype=th.float64)
         alpha_bar = th.cumprod(1 - betas, dim=0)
-        previous = th.cat((th.ones(1, dtype=th.float64), alpha_bar[:-1]))
+        previous = th.cat((previous, alpha_bar[:-1]))
         # Python floats: the loop over T steps then launches no kernels to look them up
         self._x0_scale = alpha_bar.rsqrt().tolist()
         self._noise_scale = (1 / alpha_bar - 1).sqrt().tolist()

@@ -1,6 +1,5 @@
 """The part of DDiffPG that finds, keeps, names and chooses modes."""
 
-import re
 import time
 from typing import Any
 
@@ -12,7 +11,7 @@ from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.clustering import cluster
 from sb3_ddiffpg.history import ModeEvent, ModeHistory, succeed
 from sb3_ddiffpg.interrupts import uninterrupted
-from sb3_ddiffpg.modes import ACCEPTED_NAME, Mode, ModeTable, default_name
+from sb3_ddiffpg.modes import Mode, ModeTable, check_name
 from sb3_ddiffpg.policies import DiffusionPolicy
 from sb3_ddiffpg.reclustering import Reclustering, find_modes
 from sb3_ddiffpg.trajectories import NO_MODE
@@ -132,14 +131,9 @@ class ModeControl:
         :raises ValueError: If there is no such mode, or another has that name or may be born with it
         """
         record = self._modes[ModeTable(self._modes).index(mode)]
-        if not isinstance(name, str) or not ACCEPTED_NAME.fullmatch(name) or name != name.strip():
-            raise ValueError(
-                f"name={name!r} is no name of a mode: accepted are 1 to 24 letters, digits, spaces and _.+-, not digits alone"
-            )
         if any(name == other.name for other in self._modes if other is not record):
             raise ValueError(f"name={name!r} is another mode's; the modes are {ModeTable(self._modes).names}")
-        if re.fullmatch(r"mode_\d+", name) and name != default_name(record.number):
-            raise ValueError(f"name={name!r} is reserved for the mode that is born with it")
+        check_name(name, record.number)
         self._note("renamed to", record, name)
         record.name = name
 

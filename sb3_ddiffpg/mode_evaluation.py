@@ -227,7 +227,7 @@ class ModeEvaluation:
         """
         try:
             return ModeEvaluation.from_dict(json.loads(Path(path).read_text()))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{path} is no evaluation of modes in format {_FORMAT}: {error!r}") from None
 
     @staticmethod

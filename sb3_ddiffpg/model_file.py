@@ -2,7 +2,7 @@
 
 import inspect
 import warnings
-from itertools import pairwise
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import msgspec
@@ -15,14 +15,23 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 
 from sb3_ddiffpg.envs.snapshots import normalization, restore_normalization
 from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
+from sb3_ddiffpg.rng import preserved_rng
 from sb3_ddiffpg.safe_files import check_array, convert
 
 Model = TypeVar("Model", bound=Any)
+Built = TypeVar("Built", bound=th.nn.Module)
 
 #: What a file that holds a model says it is
 KIND = "model"
 # Beyond these a small file would take hours or all of the memory
-MOST_ENVS, MOST_DIFFUSION_STEPS = 2**16, 10_000
+MOST_ENVS = 2**16
+MOST = {
+    **dict.fromkeys(("n_diffusion_steps", "n_action_gradient_steps", "n_candidates"), 10_000),
+    **dict.fromkeys(("n_steps", "mode_n_steps", "exploration_n_steps", "gradient_steps"), 100_000),
+    "batch_size": 2**24,
+}
+# Of what optimisers gather
+_NOT_NEGATIVE = ("step", "exp_avg_sq", "max_exp_avg_sq")
 # Of the constructor, but not the model's: given again when it is loaded
 GIVEN_AT_LOADING = {"policy", "env", "device", "tensorboard_log", "_init_setup_model"}
 
@@ -132,11 +141,10 @@ def build_model(
     if policy is None:
         raise ValueError("the policy is a class of one's own, which no file holds: give custom_objects={'policy': ...}")
     arguments = {**_arguments(saved.arguments, {**given, **changes}), **given, **changes}
-    _check_sizes(arguments, saved.parameters)
+    _check_arguments(arguments, saved.parameters)
     if not 1 <= saved.n_envs <= MOST_ENVS:
         raise ValueError(f"model.n_envs: {saved.n_envs} given; accepted is 1 to {MOST_ENVS}")
     observation_space, action_space = _space(saved.observation_space), _space(saved.action_space)
-    _check_one_hot(observation_space, saved.parameters)
     if env is not None:
         env = algorithm._wrap_env(env, 0)
         if saved.normalizer is not None:
@@ -149,11 +157,15 @@ def build_model(
         model.observation_space, model.action_space = observation_space, action_space
         model.n_envs = saved.n_envs if env is None else env.num_envs
         model.load_state_tree(saved.state)
+        model._in_file = saved.parameters
         model._setup_model()
+        model._in_file = None
         parameters = _parameters(model, saved.parameters)
         model.set_parameters(parameters, exact_match=True, device=model.device)
     except (TypeError, AttributeError, AssertionError, LookupError, RuntimeError, ArithmeticError, MemoryError) as error:
         raise ValueError(f"model: its arguments make no {algorithm.__name__}: {error!r}") from error
+    if env is not None and saved.normalizer is not None:  # last: the environments may be somebody's who goes on with them
+        restore_normalization(_normalizer_of(env), saved.normalizer.statistics)
     return model
 
 
@@ -173,53 +185,44 @@ def _arguments(plain: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     return arguments
 
 
-def _check_sizes(arguments: dict[str, Any], parameters: dict[str, dict[str, Any]]) -> None:
-    """Networks cannot be larger than what is there to fill them: a small file must not ask for all of the memory."""
-    total = _size(parameters)
-    steps = arguments.get("n_diffusion_steps")
-    if isinstance(steps, int) and steps > MOST_DIFFUSION_STEPS:
-        raise ValueError(f"model.arguments.n_diffusion_steps: {steps} given; accepted is at most {MOST_DIFFUSION_STEPS}")
-    sizes: list[int] = []
-
-    def collect(value: Any) -> None:
-        if isinstance(value, dict):
-            for each in value.values():
-                collect(each)
-        elif isinstance(value, (list, tuple)):
-            numbers = [each for each in value if isinstance(each, int)]
-            sizes.extend(first * second for first, second in pairwise(numbers))
-            for each in value:
-                collect(each)
-        elif isinstance(value, int):
-            sizes.append(value)
-
-    names = (
-        "policy_kwargs",
-        "novelty_kwargs",
-        "n_critics",
-        "n_atoms",
-        "n_diffusion_steps",
-        "mode_embedding_dim",
-        "latent_dim",
-    )
-    for name in names:
-        collect(arguments.get(name))
-    critics = arguments.get("n_critics", 1)
-    if sizes and max(sizes) * (critics if isinstance(critics, int) else 1) > 64 * total + 2**20:
-        raise ValueError(f"model.arguments: networks of {max(sizes)} for a file of {total} parameters")
+def _check_arguments(arguments: dict[str, Any], parameters: dict[str, dict[str, Any]]) -> None:
+    """Those by which a small file could ask for hours."""
+    for name, most in MOST.items():
+        if isinstance(value := arguments.get(name), int) and value > most:
+            raise ValueError(f"model.arguments.{name}: {value} given; accepted is at most {most} in a file")
+    n_arrays = sum(map(len, parameters.values()))
+    for name in ("policy_kwargs", "novelty_kwargs"):
+        if (longest := _longest(arguments.get(name))) > n_arrays:
+            raise ValueError(f"model.arguments.{name}: {longest} layers for a file of {n_arrays} arrays")
 
 
-def _size(parameters: dict[str, dict[str, Any]]) -> int:
-    return sum(each.size for part in parameters.values() for each in part.values() if isinstance(each, np.ndarray))
+def _longest(value: Any) -> int:
+    parts = list(value.values()) if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else []
+    return max([0 if isinstance(value, dict) else len(parts), *map(_longest, parts)])
 
 
-def _check_one_hot(space: spaces.Space, parameters: dict[str, dict[str, Any]]) -> None:
-    """A discrete observation becomes as many inputs as it has values, which the first layer must have weights for."""
-    parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
-    inputs = sum(int(each.n) for each in parts if isinstance(each, spaces.Discrete))
-    inputs += sum(int(each.nvec.sum()) for each in parts if isinstance(each, spaces.MultiDiscrete))
-    if inputs > _size(parameters):
-        raise ValueError(f"model.observation_space: {inputs} inputs for a file of {_size(parameters)} parameters")
+def sized_as(expected: dict[str, Any], part: str, make: Callable[..., Built], *args: Any, **kwargs: Any) -> Built:
+    """
+    Make a part of a model, after one without memory has shown that a file has all that fills it: a small file must not ask for
+    all of the memory.
+
+    :param expected: The arrays of the file, by name
+    :param part: Name of the part, for the message
+    :param make: Makes it
+    :param args: Its arguments
+    :param kwargs: Its arguments
+    :return: The part
+    :raises ValueError: If the file has other arrays
+    """
+    with th.device("meta"), preserved_rng():
+        needed = {name: list(value.shape) for name, value in make(*args, **kwargs).state_dict().items()}
+    there = {name: list(np.shape(value)) for name, value in expected.items()}
+    if needed != there:
+        different = next(name for name in sorted(needed.keys() | there.keys()) if needed.get(name) != there.get(name))
+        raise ValueError(
+            f"model.parameters.{part}.{different}: of shape {there.get(different)}; accepted is {needed.get(different)}"
+        )
+    return make(*args, **kwargs)
 
 
 # ------------------------------------------------------------------ spaces
@@ -292,8 +295,11 @@ def _parameters(model: Any, trees: dict[str, dict[str, Any]]) -> dict[str, Tenso
 
 
 def _tensor(array: Any, like: th.Tensor, what: str) -> th.Tensor:
-    array = convert(array, np.ndarray, what)
-    return th.from_numpy(check_array(array, _numpy_dtype(like), list(like.shape), what).copy())
+    array = check_array(convert(array, np.ndarray, what), _numpy_dtype(like), list(like.shape), what)
+    # A factor of zero has the logarithm -inf
+    if np.isnan(array).any() or (np.isinf(array).any() and not what.endswith("log_entropy_coef")):
+        raise ValueError(f"{what}: there are numbers that are not finite")
+    return th.from_numpy(array.copy())
 
 
 def _numpy_dtype(tensor: th.Tensor) -> np.dtype:
@@ -314,7 +320,10 @@ def _optimizer(optimizer: th.optim.Optimizer, own: dict[str, Any], tree: dict[st
         for key, value in values.items():
             if isinstance(before[key], (float, bool, tuple)) and not isinstance(value, (type(before[key]), int)):
                 raise ValueError(f"{what}.{key}: {value!r} given, where {before[key]!r} was")
+        _check_settings(optimizer, values, what)
         restored.append(values)
+    if len({tuple(sorted(each)) for each in states.values()}) > 1:
+        raise ValueError(f"{what}: it has gathered different things of different parameters")
     state: dict[int, dict[str, th.Tensor]] = {}
     for index, each in states.items():
         if not index.isdecimal() or int(index) >= len(parameters):
@@ -323,8 +332,23 @@ def _optimizer(optimizer: th.optim.Optimizer, own: dict[str, Any], tree: dict[st
         arrays = {key: convert(array, np.ndarray, what) for key, array in convert(each, dict[str, Any], what).items()}
         for key, array in arrays.items():
             check_array(array, dtype if array.ndim else array.dtype, shape if array.ndim else [], f"{what}.{key}")
+            if not np.isfinite(array).all() or (key in _NOT_NEGATIVE and (array < 0).any()):
+                raise ValueError(f"{what}.{key}: there are numbers that cannot be")
         state[int(index)] = {key: th.from_numpy(array.copy()) for key, array in arrays.items()}
     return {"state": state, "param_groups": restored}
+
+
+def _check_settings(optimizer: th.optim.Optimizer, values: dict[str, Any], what: str) -> None:
+    """The optimiser's own constructor knows what they may be."""
+    kind: Any = type(optimizer)
+    accepted = inspect.signature(kind.__init__).parameters
+    try:
+        for value in values.values():
+            if isinstance(value, (float, tuple)) and not np.isfinite(value).all():
+                raise ValueError(f"{value} is not finite")
+        kind([th.zeros(1)], **{name: value for name, value in values.items() if name in accepted and name != "params"})
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{what}: {error}") from None
 
 
 # ------------------------------------------------------------------ normalisation
@@ -338,17 +362,23 @@ def _normalizer_tree(env: VecNormalize) -> dict[str, Any]:
 
 
 def _normalized(env: Any, saved: _Normalizer) -> VecEnv:
-    """The environments, normalised as those of the model were."""
+    """The environments, in a wrapper that will normalise them as those of the model were."""
     settings = {name: from_plain(value) for name, value in saved.settings.items()}
     if set(settings) != set(_NORMALIZER_SETTINGS):
         raise ValueError(f"model.normalizer: settings {sorted(settings)} given; accepted are {sorted(_NORMALIZER_SETTINGS)}")
     for name in ("clip_obs", "clip_reward", "gamma", "epsilon"):
         convert(settings[name], float, f"model.normalizer.{name}")
-    normalizer = unwrap_vec_normalize(env)  # there may be wrappers around it
-    if normalizer is None:
-        try:
-            env = normalizer = VecNormalize(env, **settings)
-        except (TypeError, ValueError, AssertionError, KeyError) as error:
-            raise ValueError(f"model.normalizer: {error}") from None
-    restore_normalization(normalizer, saved.statistics)
-    return env
+        if not 0 < settings[name] < np.inf:
+            raise ValueError(f"model.normalizer.{name}: {settings[name]} given; accepted are positive numbers")
+    if unwrap_vec_normalize(env) is not None:  # there may be wrappers around it
+        return env
+    try:
+        return VecNormalize(env, **settings)
+    except (TypeError, ValueError, AssertionError, KeyError) as error:
+        raise ValueError(f"model.normalizer: {error}") from None
+
+
+def _normalizer_of(env: VecEnv) -> VecNormalize:
+    normalizer = unwrap_vec_normalize(env)
+    assert normalizer is not None
+    return normalizer

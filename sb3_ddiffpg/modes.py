@@ -4,12 +4,12 @@ import re
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
-from sb3_ddiffpg.safe_files import check_array, convert
+from sb3_ddiffpg.safe_files import Count, check_array, convert
 
 # A name stands in tables, legends, on command lines (where a number would be an index) and in tags of a log that cuts them
 ACCEPTED_NAME = re.compile(r"(?!_)(?=.*[^\W\d])[\w .+-]{1,24}")
@@ -36,6 +36,21 @@ def default_name(number: int) -> str:
     :return: The name that it is born with
     """
     return f"mode_{number}"
+
+
+def check_name(name: Any, number: int) -> None:
+    """
+    :param name: That a mode is to have
+    :param number: The mode's
+    :raises ValueError: If it is no name, or another mode may be born with it
+    """
+    if not isinstance(name, str) or not ACCEPTED_NAME.fullmatch(name) or name != name.strip():
+        given = repr(name)[:100]
+        raise ValueError(
+            f"name={given} is no name of a mode: accepted are 1 to 24 letters, digits, spaces and _.+-, not digits alone"
+        )
+    if re.fullmatch(r"mode_\d+", name) and name != default_name(number):
+        raise ValueError(f"name={name!r} is reserved for the mode that is born with it")
 
 
 @dataclass(eq=False)
@@ -92,18 +107,18 @@ class Mode:
 
 
 class _State(msgspec.Struct, forbid_unknown_fields=True):
-    number: int
+    number: Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
     name: str
-    born_at: int
-    n_trajectories: int
+    born_at: Count
+    n_trajectories: Count
     mean_length: float
     mean_return: float
     representative: np.ndarray
     frozen: bool
-    outcomes: list[tuple[bool, float, int]]
-    doubts: int
-    misses: int
-    unjudged: int
+    outcomes: list[tuple[bool, float, Count]]
+    doubts: Count
+    misses: Count
+    unjudged: Count
 
 
 def modes_state(modes: Sequence[Mode]) -> list[dict[str, Any]]:
@@ -127,8 +142,9 @@ def modes_from_state(state: Any) -> list[Mode]:
     modes = []
     for known in convert(state, list[_State], "modes"):
         check_array(known.representative, np.float32, [None, None], "modes.representative")
-        if not ACCEPTED_NAME.fullmatch(known.name):
-            raise ValueError(f"modes: {known.name[:50]!r} is no name of a mode")
+        if not np.isfinite(known.representative).all():
+            raise ValueError("modes.representative: there are numbers that are not finite")
+        check_name(known.name, known.number)
         values = {name: getattr(known, name) for name in known.__struct_fields__ if name != "outcomes"}
         modes.append(Mode(**values))
         modes[-1].outcomes.extend(Outcome(*each) for each in known.outcomes)

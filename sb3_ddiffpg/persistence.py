@@ -4,19 +4,20 @@ import contextlib
 import io
 import pathlib
 from collections import defaultdict
-from collections.abc import Iterable
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import torch as th
+from msgspec import Meta
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
 
 from sb3_ddiffpg.checkpoints import InterruptedRun, read_checkpoint
 from sb3_ddiffpg.interrupts import handlers_restored
-from sb3_ddiffpg.model_file import KIND, build_model, model_tree
+from sb3_ddiffpg.model_file import KIND, Built, build_model, model_tree, sized_as
 from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
-from sb3_ddiffpg.safe_files import convert, read, write
+from sb3_ddiffpg.safe_files import Count, convert, read, write
 from sb3_ddiffpg.visits import VisitMap
 
 SelfSavable = TypeVar("SelfSavable", bound="SavableAlgorithm")
@@ -39,16 +40,20 @@ class SavableAlgorithm(OffPolicyAlgorithm):
     #: Networks of the policy that follow others slowly and only train: what they follow, by name
     target_networks: ClassVar[dict[str, str]] = {}
     _saves_to_act = False
+    #: While it is made of a file: the file's arrays, by part
+    _in_file: dict[str, dict[str, Any]] | None = None
+    #: Of ``learn``, for callbacks: what they hold is given back however it ends
+    until_learn_ends: contextlib.ExitStack
     #: Attributes that are plain values, and their types
     _counters: ClassVar[dict[str, Any]] = {
-        "num_timesteps": int,
-        "_total_timesteps": int,
-        "_num_timesteps_at_start": int,
-        "_learn_began_at": int,
+        "num_timesteps": Count,
+        "_total_timesteps": Count,
+        "_num_timesteps_at_start": Count,
+        "_learn_began_at": Count,
         "run_id": str,
-        "_episode_num": int,
-        "_n_updates": int,
-        "_current_progress_remaining": float,
+        "_episode_num": Count,
+        "_n_updates": Count,
+        "_current_progress_remaining": Annotated[float, Meta(ge=-(2.0**53), le=1.0)],
         "env_spec": str | None,
         "is_normalized": bool,
         "_warned_support": bool,
@@ -72,7 +77,7 @@ class SavableAlgorithm(OffPolicyAlgorithm):
             total_timesteps, reset_num_timesteps = max(0, total_timesteps - done), False
         else:
             self._learn_began_at = 0 if reset_num_timesteps else self.num_timesteps
-        with handlers_restored():
+        with handlers_restored(), contextlib.ExitStack() as self.until_learn_ends:
             return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def save(
@@ -218,6 +223,20 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         model._interrupted.restore_buffer_and_environments(model)
         return model
 
+    def _built(self, part: str, make: Callable[..., Built], *args: Any, **kwargs: Any) -> Built:
+        """
+        Make a part of the model, see ``model_file.sized_as``.
+
+        :param part: Its name among the parameters
+        :param make: Makes it
+        :param args: Its arguments
+        :param kwargs: Its arguments
+        :return: The part
+        """
+        if self._in_file is None:
+            return make(*args, **kwargs)
+        return sized_as(self._in_file.get(part, {}), part, make, *args, **kwargs)
+
     def state_tree(self) -> dict[str, Any]:
         """
         :return: Numbers and records beside the networks, in plain values and arrays
@@ -263,4 +282,4 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         """
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_interrupted", "_saves_to_act"]
+        return [*super()._excluded_save_params(), "_interrupted", "_saves_to_act", "until_learn_ends", "_in_file"]

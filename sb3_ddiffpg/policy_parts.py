@@ -41,8 +41,10 @@ class SavablePolicy(BasePolicy):
         :return: An optimiser of the policy's class
         """
         kwargs = self.optimizer_kwargs
+        parameters = list(parameters)
         chosen = {"fused", "foreach", "differentiable"} & set(kwargs)
-        if not chosen and self.optimizer_class in (th.optim.Adam, th.optim.AdamW):
+        without_memory = any(each.is_meta for each in parameters)  # only its sizes are asked for, and no kernel knows it
+        if not chosen and self.optimizer_class in (th.optim.Adam, th.optim.AdamW) and not without_memory:
             # One kernel instead of one per parameter: a third of a small update's time
             kwargs = {"fused": True, **kwargs}
         make: Any = self.optimizer_class

@@ -33,6 +33,18 @@ from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 _ROUTES_DRAWN = 20
 
 
+def _remembered(env_spec: str) -> tuple[str, dict[str, Any]]:
+    """Id and arguments of the environment of a model, which may be a stranger's: no module is imported on its behalf."""
+    try:
+        spec = EnvSpec.from_json(env_spec)
+        kwargs = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
+        if spec.id not in gym.registry:
+            raise ValueError(f"{spec.id!r} is not registered")
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, AssertionError, gym.error.Error) as error:
+        raise ValueError(f"--env: not given, and what the model remembers is no environment here: {error!r}") from None
+    return spec.id, {name: value for name, value in kwargs.items() if name != "render_mode" and value is not None}
+
+
 @dataclass(frozen=True)
 class Task:
     """
@@ -60,9 +72,7 @@ class Task:
         if env_id is None:
             if model.env_spec is None:
                 raise ValueError("--env: not given, and the model does not remember the environment in which it was trained")
-            spec = EnvSpec.from_json(model.env_spec)
-            env_id, kwargs = spec.id, {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
-            kwargs = {name: value for name, value in kwargs.items() if name != "render_mode" and value is not None}
+            env_id, kwargs = _remembered(model.env_spec)
         if env_id not in gym.registry:
             raise ValueError(f"--env: {env_id!r} is not registered")
         if is_ours(env_id):

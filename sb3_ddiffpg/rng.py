@@ -62,6 +62,10 @@ def restore_global_rng(tree: Any) -> None:
     check_array(state.torch, np.uint8, [len(th.get_rng_state())], "random states.torch")
     if not 0 <= state.numpy_rest[0] <= 624:  # NumPy would read beyond its array
         raise ValueError(f"random states.numpy: position {state.numpy_rest[0]} given; accepted are 0 to 624")
+    # Of torch's generator: how many of its 624 numbers are left, and which is next; it would read beyond them too
+    left, following = int(state.torch[8:12].view(np.int32)[0]), int(state.torch[16:24].view(np.uint64)[0])
+    if (left, following) != (1, 0) and not (1 <= left <= 624 and left + following == 625):
+        raise ValueError(f"random states.torch: {left} left and {following} next given; accepted are 625 together")
     version, numbers, gauss = state.python
     try:
         random.setstate((version, tuple(numbers), gauss))

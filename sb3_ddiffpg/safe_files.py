@@ -6,9 +6,11 @@ import hashlib
 import json
 import os
 import re
+import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -16,11 +18,16 @@ import torch as th
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+#: How often something was; NumPy and floats hold it
+Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
+
 FORMAT = "sb3_ddiffpg"
 #: Counted up when a file means something else than before
 VERSION = 1
 # Key of the one-entry dict that stands in the JSON for an array
 _ARRAY = "$array"
+# Longer than anything that we write: a reader needs a hundred times the memory
+_LONGEST = 2**24
 # Deeper than anything that we write, and shallow enough for every reader
 _DEEPEST = 50
 
@@ -37,10 +44,17 @@ def write(path: Path, kind: str, tree: Any) -> None:
     """
     arrays: dict[str, np.ndarray] = {}
     text = json.dumps(_pack(tree, "", arrays))
+    if len(text) > _LONGEST:
+        raise TypeError(f"{path.name}: {len(text)} characters of plain values; accepted are up to {_LONGEST}")
     metadata = {"format": FORMAT, "version": str(VERSION), "kind": kind, "tree": text, "sha256": _digest(kind, text, arrays)}
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    # A folder of its own, for safetensors writes beside the file what it renames
+    place = Path(tempfile.mkdtemp(prefix=f".{path.name}.{os.getpid()}.", dir=path.parent))
+    unfinished = place / path.name
     try:
+        unfinished.touch()
+        mode = unfinished.stat().st_mode  # as the user wants files, which safetensors does not ask
         save_file(arrays, unfinished, metadata)
+        unfinished.chmod(mode)
         with unfinished.open("rb") as file:
             os.fsync(file.fileno())
         os.replace(unfinished, path)
@@ -49,8 +63,7 @@ def write(path: Path, kind: str, tree: Any) -> None:
         number = int(named[1]) if named else errno.EIO
         raise OSError(number, f"{os.strerror(number)} ({error})", str(path)) from None
     finally:
-        with contextlib.suppress(OSError):
-            unfinished.unlink(missing_ok=True)
+        shutil.rmtree(place, ignore_errors=True)
     _sync_folder(path.parent)
 
 
@@ -74,28 +87,33 @@ def read(path: Path, kind: str) -> Any:
             if metadata.get("kind") != kind:
                 raise ValueError(f"{path} holds a {metadata.get('kind')!r}, not a {kind!r}")
             arrays = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, OSError, TypeError, KeyError, MemoryError) as error:
+    except (SafetensorError, OSError, TypeError, KeyError, AttributeError, MemoryError) as error:  # NumPy has fewer types
         raise ValueError(f"{path} is damaged, or no file of {FORMAT}: {error}") from None
     text = metadata.get("tree", "")
+    if len(text) > _LONGEST:
+        raise ValueError(f"{path}: {len(text)} characters of plain values; accepted are up to {_LONGEST}")
     if metadata.get("sha256") != _digest(kind, text, arrays):
         raise ValueError(f"{path} is damaged: its contents do not fit their checksum")
     try:
-        return _unpack(json.loads(text), arrays)
+        tree = _unpack(json.loads(text), arrays, "")
+        if arrays:
+            raise ValueError(f"{sorted(arrays)[:3]} have no place in it")
+        return tree
     except (ValueError, RecursionError, KeyError) as error:
         raise ValueError(f"{path} is damaged: {error}") from None
 
 
 def remove_unfinished(folder: Path, names: str) -> None:
     """
-    What writers left behind that were killed.
+    What writers left behind that were killed, also one of this process's number: nothing else must be writing.
 
     :param folder: Where they wrote
     :param names: Pattern of the files' names
     """
-    for path in folder.glob(f".{names}.*"):
-        number = path.suffix[1:]
-        if number.isdecimal() and path.is_file() and not _is_running(int(number)):
-            path.unlink(missing_ok=True)
+    for path in folder.glob(f".{names}.*.*"):
+        number = path.suffixes[-2][1:]
+        if number.isdecimal() and path.is_dir() and (int(number) == os.getpid() or not _is_running(int(number))):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _is_running(process: int) -> bool:
@@ -157,24 +175,30 @@ def _pack(tree: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
         for key in tree:
             if not isinstance(key, str) or key.startswith("$"):
                 raise TypeError(f"{place}: keys must be strings without '$' in front, got {key!r}")
-        # As in JSON pointers, so that {"a/b": x} and {"a": {"b": y}} are two places
-        names = {key: key.replace("~", "~0").replace("/", "~1") for key in tree}
-        return {key: _pack(value, f"{place}/{names[key]}", arrays) for key, value in tree.items()}
+        return {key: _pack(value, f"{place}/{_name(key)}", arrays) for key, value in tree.items()}
     if isinstance(tree, Sequence):
         return [_pack(value, f"{place}/{i}", arrays) for i, value in enumerate(tree)]
     raise TypeError(f"{place}: {tree!r} of {type(tree)} cannot be saved")
 
 
-def _unpack(packed: Any, arrays: dict[str, np.ndarray], depth: int = 0) -> Any:
+def _unpack(packed: Any, arrays: dict[str, np.ndarray], place: str, depth: int = 0) -> Any:
+    """The tree of what JSON held; each array is taken out of ``arrays`` at its place, or a small file would hold many."""
     if depth > _DEEPEST:
         raise ValueError(f"more than {_DEEPEST} lists and dicts in one another")
     if isinstance(packed, list):
-        return [_unpack(each, arrays, depth + 1) for each in packed]
+        return [_unpack(each, arrays, f"{place}/{i}", depth + 1) for i, each in enumerate(packed)]
     if isinstance(packed, dict):
         if set(packed) == {_ARRAY}:
-            return arrays[str(packed[_ARRAY])]
-        return {key: _unpack(each, arrays, depth + 1) for key, each in packed.items()}
+            if packed[_ARRAY] != place:
+                raise ValueError(f"an array of another place at {place[:100]!r}")
+            return arrays.pop(place)
+        return {key: _unpack(each, arrays, f"{place}/{_name(key)}", depth + 1) for key, each in packed.items()}
     return packed
+
+
+def _name(key: str) -> str:
+    """As in JSON pointers, so that {"a/b": x} and {"a": {"b": y}} are two places."""
+    return key.replace("~", "~0").replace("/", "~1")
 
 
 def _digest(kind: str, text: str, arrays: dict[str, np.ndarray]) -> str:

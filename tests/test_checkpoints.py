@@ -10,7 +10,9 @@ import time
 import numpy as np
 import pytest
 import torch as th
-from environments import SMALL, TwoEnds, assert_same_state, state_of
+from environments import SMALL, TwoEnds, assert_same_state, copied, state_of
+from filelock import FileLock
+from rl_zoo3 import gym_patches
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     EvalCallback,
@@ -27,9 +29,11 @@ from test_resume import assert_same_buffer
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES
-from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
+from sb3_ddiffpg.checkpoints import KIND, RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.envs import make_vec_env
+from sb3_ddiffpg.envs.snapshots import env_snapshot, restore_env
 from sb3_ddiffpg.rng import global_rng, restore_generator, restore_global_rng
+from sb3_ddiffpg.safe_files import read, write
 
 END = 560
 
@@ -203,7 +207,7 @@ def test_a_full_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", refuse)
     with pytest.warns(UserWarning, match="No space left"):
         model.learn(120, callback=callback, reset_num_timesteps=False)
-    assert model.num_timesteps >= 240 and list(tmp_path.iterdir()) == [kept]
+    assert model.num_timesteps >= 240 and list(tmp_path.glob("[!.]*")) == [kept]
     monkeypatch.undo()
     assert DDiffPG.resume(tmp_path, known_ends()).num_timesteps == steps
 
@@ -240,7 +244,7 @@ def test_what_cannot_be_saved_is_said_before_the_first_step(tmp_path):
             return {"what": object()}
 
     with pytest.raises(TypeError, match="what: <object object .* cannot be saved"):
-        model.learn(100, callback=[RunCheckpointCallback(tmp_path), Unsayable(tmp_path)], reset_num_timesteps=False)
+        model.learn(100, callback=[RunCheckpointCallback(tmp_path), Unsayable(tmp_path / "other")], reset_num_timesteps=False)
 
 
 def test_what_cannot_be_saved_later_does_not_end_the_training(tmp_path):
@@ -350,12 +354,148 @@ def test_what_a_killed_writer_left_is_swept_away(tmp_path):
     """But not what another process is about to finish, nor other files."""
     finished = subprocess.Popen([sys.executable, "-c", ""])
     finished.wait()
-    left = tmp_path / f".checkpoint_000000000100.safetensors.{finished.pid}"
-    kept = [tmp_path / f".checkpoint_000000000200.safetensors.{os.getpid()}", tmp_path / f".notes.{finished.pid}"]
-    for path in (left, *kept):
-        path.write_bytes(b"half")
+    left = tmp_path / f".checkpoint_000000000100.safetensors.{finished.pid}.abc"
+    own = tmp_path / f".checkpoint_000000000200.safetensors.{os.getpid()}.abc"  # in a container all have the same number
+    kept = [tmp_path / f".checkpoint_000000000200.safetensors.{os.getppid()}.abc", tmp_path / f".notes.{finished.pid}.abc"]
+    for path in (left, own, *kept):
+        path.mkdir()
+        (path / "half").write_bytes(b"half")
     model_for(known_ends()).learn(50, callback=RunCheckpointCallback(tmp_path))
-    assert not left.exists() and all(path.exists() for path in kept)
+    assert not left.exists() and not own.exists() and all(path.exists() for path in kept)
+
+
+def test_two_trainings_do_not_share_a_folder(tmp_path):
+    """From one checkpoint both would remove what the other has come to. However the first ends, the folder is free again."""
+    first, second = model_for(known_ends()), model_for(known_ends())
+
+    class Intrudes(BaseCallback):
+        def _on_step(self):
+            with pytest.raises(ValueError, match="another training writes its checkpoints to"):
+                second.learn(50, callback=RunCheckpointCallback(tmp_path))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        first.learn(100, callback=[RunCheckpointCallback(tmp_path), Intrudes()])
+    with FileLock(tmp_path / ".lock", blocking=False):
+        pass
+
+
+def test_what_is_further_than_the_run_is_not_written_over(tmp_path):
+    """Who goes on from an older checkpoint would be overtaken by the newer one at the next ``resume``."""
+    model_for(known_ends()).learn(400, callback=RunCheckpointCallback(tmp_path, save_freq=100, keep=10))
+    older = checkpoint_files(tmp_path)[2]
+    resumed = silent(DDiffPG.resume(older, known_ends()))
+    with pytest.raises(ValueError, match="holds a checkpoint that is further than step"):
+        resumed.learn(400, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+    steps = resumed.num_timesteps
+    for path in checkpoint_files(tmp_path)[:2]:
+        path.unlink()
+    # Refused once, it still goes on where it was
+    resumed.learn(400, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+    whole = model_for(known_ends())
+    whole.learn(400)
+    assert steps < 400 and outcome(resumed) == outcome(whole)
+
+
+def test_a_damaged_one_that_is_further_goes_first(tmp_path):
+    model = model_for(known_ends())
+    model.learn(400, callback=RunCheckpointCallback(tmp_path, save_freq=100, keep=3))
+    newest, *others = checkpoint_files(tmp_path)
+    newest.write_bytes(b"damaged")
+    for path in others:  # a clock that was set back
+        os.utime(path, (0, 0))
+    with pytest.warns(UserWarning, match="Going on with the checkpoint before it"):
+        resumed = silent(DDiffPG.resume(tmp_path, known_ends()))
+    resumed.learn(400, callback=[StopAt(resumed.num_timesteps + 20), RunCheckpointCallback(tmp_path, save_freq=10, keep=2)])
+    kept = checkpoint_files(tmp_path)
+    assert newest not in kept and len(kept) == 2 and not any("damaged" in str(path.read_bytes()[:20]) for path in kept)
+    assert int(kept[0].stem[-12:]) == resumed.num_timesteps
+
+
+class StopAt(BaseCallback):
+    def __init__(self, step):
+        super().__init__()
+        self.step = step
+
+    def _on_step(self):
+        return self.num_timesteps < self.step
+
+
+@pytest.mark.parametrize("kind", ["link", "folder", "pipe", "gone"])
+def test_what_is_no_file_is_passed_over(tmp_path, monkeypatch, kind):
+    model_for(known_ends()).learn(200, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+    bad = tmp_path / "checkpoint_999999999999.safetensors"
+    if kind == "link":
+        bad.symlink_to(tmp_path / "nowhere")
+    elif kind == "folder":
+        bad.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(bad)
+    else:
+        files = [bad, *checkpoint_files(tmp_path)]
+        monkeypatch.setattr("sb3_ddiffpg.checkpoints.checkpoint_files", lambda _: files)
+    with pytest.warns(UserWarning, match="Going on with the checkpoint before it"):
+        resumed = silent(DDiffPG.resume(tmp_path, known_ends()))
+    assert 100 <= resumed.num_timesteps
+    resumed.learn(250, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+
+
+def test_what_cannot_be_removed_does_not_end_the_training(tmp_path, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr("pathlib.Path.unlink", refuse)
+    with pytest.warns(UserWarning, match="is not needed any more, and cannot be removed: .*not permitted"):
+        model = model_for(known_ends()).learn(300, callback=RunCheckpointCallback(tmp_path, save_freq=100, keep=1))
+    assert model.num_timesteps >= 300 and len(checkpoint_files(tmp_path)) > 1
+
+
+def test_a_disk_that_is_full_at_the_beginning_is_told_at_once(tmp_path, monkeypatch):
+    model_for(known_ends()).learn(200, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+    resumed = silent(DDiffPG.resume(tmp_path, known_ends()))
+    began = resumed.num_timesteps
+    monkeypatch.setattr("sb3_ddiffpg.checkpoints.write", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    with pytest.warns(UserWarning, match=f"No checkpoint at step {began}: .*No space left"):
+        resumed.learn(260, callback=RunCheckpointCallback(tmp_path, save_freq=10**6))
+
+
+def test_environments_that_cannot_be_saved_are_told_at_the_beginning(tmp_path):
+    with pytest.warns(UserWarning, match="a run that goes on begins new ones"):
+        model_for(DummyVecEnv([TwoEnds] * 4)).learn(20, callback=RunCheckpointCallback(tmp_path))
+
+
+def test_the_zoos_time_limit_is_saved_as_gymnasiums(monkeypatch):
+    """The zoo replaces it in every process that imports it; a run may go on where nobody has."""
+    patched = gym_patches.PatchedTimeLimit
+    plain = patched.__mro__[1]
+    for first, second in ((patched, plain), (plain, patched), (patched, patched)):
+        env, other = first(KnownEnds(), 5), second(KnownEnds(), 5)
+        for each in (env, other):
+            each.reset(seed=1)
+        env.step(np.ones(1))
+        restore_env(other, copied(env_snapshot(env)))
+        assert other._elapsed_steps == 1 and other.unwrapped.x == env.unwrapped.x
+    for value in ("abc", -1, 2**70):
+        tree = copied(env_snapshot(env))
+        tree["layers"][0]["values"]["_elapsed_steps"] = value
+        with pytest.raises(ValueError, match="_elapsed_steps"):
+            restore_env(other, tree)
+
+
+def test_tests_along_the_way_go_on_too(tmp_path):
+    """SB3's own draws from the random states of training, and its environments have states of their own."""
+
+    def callbacks(folder):
+        tests = EvalCallback(known_ends(2), n_eval_episodes=3, eval_freq=20, deterministic=False, verbose=0)
+        return [tests, RunCheckpointCallback(folder, save_freq=50, keep=20)]
+
+    whole, asked = model_for(known_ends()), callbacks(tmp_path / "whole")
+    whole.learn(400, callback=asked)
+    for path in checkpoint_files(tmp_path / "whole")[1::2]:
+        resumed, again = silent(DDiffPG.resume(path, known_ends())), callbacks(tmp_path / path.stem)
+        resumed.learn(400, callback=again)
+        assert outcome(resumed) == outcome(whole)
+        assert again[0].last_mean_reward == asked[0].last_mean_reward
 
 
 def test_what_a_monitor_notes_may_be_anything(tmp_path):
@@ -477,3 +617,39 @@ def test_a_random_state_that_numpy_would_crash_with_is_refused():
     for position in (-1, 625, 2**30):
         with pytest.raises(ValueError, match="accepted are 0 to 624"):
             restore_global_rng({**state, "numpy_rest": [position, *state["numpy_rest"][1:]]})
+
+
+def test_a_random_state_that_torch_would_read_beyond_is_refused():
+    state = global_rng()
+    for left, following in ((624, 624), (0, 625), (1, 1), (625, 0), (-5, 630)):
+        raw = np.array(state["torch"])
+        raw[8:12] = np.array([left], dtype=np.int32).view(np.uint8)
+        raw[16:24] = np.array([following], dtype=np.uint64).view(np.uint8)
+        with pytest.raises(ValueError, match="random states.torch"):
+            restore_global_rng({**copied(state), "torch": raw})
+    for n in range(700):  # whatever it makes itself is accepted
+        th.rand(n % 7)
+        restore_global_rng(copied(global_rng()))
+
+
+def test_runs_that_contradict_themselves_are_refused(tmp_path):
+    """When they are read, not in the midst of ``learn``."""
+    model_for(known_ends()).learn(200, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+    path = checkpoint_files(tmp_path)[0]
+    for change, said in (
+        (lambda run: run["environments"]["layers"].append({"kind": "DummyVecEnv", "values": {}}), "saved with a DummyVecEnv"),
+        (lambda run: run.update(noise="hello"), "noise: 'hello' is none"),
+        (lambda run: run["episodes"].update(groups=np.zeros(7, dtype=np.int64)), "behavior"),
+        (lambda run: run.update(last_obs=np.zeros((4, 3), dtype=np.float32)), "last_obs"),
+        (lambda run: run.update(last_obs=np.full((4, 2), np.nan, dtype=np.float32)), "last_obs"),
+        (lambda run: run.update(last_episode_starts=np.zeros(9, dtype=bool)), "last_episode_starts"),
+        (lambda run: run["buffer"].update(n_finished=2**70), "n_finished"),
+        (lambda run: run["buffer"]["running_return"].fill(np.nan), "a number that is not finite"),
+        (lambda run: run["buffer"]["parts"][-1].fill(255), "replay buffer"),
+        (lambda run: run["random"].update(python=[3, [1], None]), "random states"),
+    ):
+        tree = read(path, KIND)
+        change(tree["run"])
+        write(tmp_path / "changed.safetensors", KIND, tree)
+        with pytest.raises(ValueError, match=said):
+            DDiffPG.resume(tmp_path / "changed.safetensors", known_ends())

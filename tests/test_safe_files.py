@@ -1,7 +1,12 @@
 """Files without code: what goes in comes out, and nothing that comes from a stranger is run."""
 
 import json
+import os
 import pickle
+import resource
+import subprocess
+import sys
+import threading
 import zipfile
 
 import numpy as np
@@ -29,7 +34,7 @@ from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.model_file import build_model, model_tree
 from sb3_ddiffpg.plain_values import from_plain, to_plain
-from sb3_ddiffpg.safe_files import convert, read, write
+from sb3_ddiffpg.safe_files import _digest, convert, read, remove_unfinished, write
 from sb3_ddiffpg.schedules import LateLinearSchedule
 
 PLAIN = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
@@ -61,6 +66,67 @@ def test_what_goes_in_comes_out(tmp_path_factory, tree):
     path = tmp_path_factory.mktemp("tree") / "file"
     write(path, "thing", tree)
     assert_same_tree(read(path, "thing"), tree)
+
+
+def test_each_array_has_one_place(tmp_path):
+    """Named many times, a small file would hold many; named nowhere, it would hide."""
+    for tree in ('[{"$array": "/0"}, {"$array": "/0"}]', '[{"$array": "/1"}]', "[]", '{"0": [{"$array": "/0"}]}'):
+        arrays = {"/0": np.zeros(3)}
+        metadata = {"format": "sb3_ddiffpg", "version": "1", "kind": "thing", "tree": tree}
+        save_file(arrays, tmp_path / "file", {**metadata, "sha256": _digest("thing", tree, arrays)})
+        with pytest.raises(ValueError, match="an array of another place|have no place"):
+            read(tmp_path / "file", "thing")
+
+
+def test_too_many_plain_values(tmp_path, monkeypatch):
+    write(tmp_path / "file", "thing", list(range(100)))
+    monkeypatch.setattr("sb3_ddiffpg.safe_files._LONGEST", 200)
+    with pytest.raises(ValueError, match="390 characters of plain values; accepted are up to 200"):
+        read(tmp_path / "file", "thing")
+    with pytest.raises(TypeError, match="390 characters"):
+        write(tmp_path / "other", "thing", list(range(100)))
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("dtype", ["F8_E4M3", "F8_E5M2", "BF16"])
+def test_numbers_that_numpy_does_not_have(tmp_path, dtype):
+    size = {"BF16": 2}.get(dtype, 1)
+    header = json.dumps(
+        {
+            "__metadata__": {"format": "sb3_ddiffpg", "version": "1", "kind": "thing", "tree": "[]", "sha256": ""},
+            "/0": {"dtype": dtype, "shape": [1], "data_offsets": [0, size]},
+        }
+    ).encode()
+    (tmp_path / "file").write_bytes(len(header).to_bytes(8, "little") + header + bytes(size))
+    with pytest.raises(ValueError, match="is damaged"):
+        read(tmp_path / "file", "thing")
+
+
+def test_many_write_one_file(tmp_path):
+    """Each whole, whoever is the last; as readable as the user wants files; and nothing else is left."""
+    path = tmp_path / "file"
+    writers = [threading.Thread(target=write, args=(path, "thing", [np.full(1000, i)] * 1)) for i in range(8)]
+    for each in writers:
+        each.start()
+    for each in writers:
+        each.join()
+    assert len(set(read(path, "thing")[0])) == 1 and list(tmp_path.iterdir()) == [path]
+    (tmp_path / "plain").touch()
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_killed_writer_leaves_what_can_be_swept_away(tmp_path):
+    script = "import os, sys, signal, pathlib, numpy; from sb3_ddiffpg import safe_files\n"
+    script += "safe_files.os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)\n"
+    script += "safe_files.write(pathlib.Path(sys.argv[1]), 'thing', [numpy.zeros(1000)])"
+    done = subprocess.run([sys.executable, "-c", script, tmp_path / "a_1.x"])
+    assert done.returncode == -9 and len(list(tmp_path.rglob("*"))) >= 2
+    own = tmp_path / f".a_2.x.{os.getpid()}.abc"
+    another = tmp_path / f".a_3.x.{os.getppid()}.abc"
+    for place in (own, another):
+        place.mkdir()
+    remove_unfinished(tmp_path, "a_*.x")
+    assert list(tmp_path.rglob("*")) == [another]
 
 
 def test_only_plain_values_go_in(tmp_path):
@@ -241,6 +307,56 @@ def test_code_in_a_zip_a_buffer_or_a_normalizer_is_not_run(trained, tmp_path):
     RAN.clear()
 
 
+def _set(tree, place, value):
+    for key in place[:-1]:
+        tree = tree[key]
+    if value is None:
+        del tree[place[-1]]
+    else:
+        tree[place[-1]] = value
+
+
+@pytest.mark.parametrize("name", ["nan", "inf"])
+def test_weights_that_are_no_numbers_are_refused(trained, name):
+    for part in ("actor.diffusion.denoiser.action_in.weight", "mode_embeddings", "critics.weights.0"):
+        tree = read_back(trained)
+        tree["parameters"]["policy"][part].flat[0] = float(name)
+        with pytest.raises(ValueError, match=f"{part}: there are numbers that are not finite"):
+            build_model(DDiffPG, tree)
+
+
+def test_records_that_no_training_makes_are_refused(trained):
+    """What would fail, or do harm, only when training has begun."""
+    of_optimizer = ("parameters", "actor.optimizer")
+    for place, value, said in (
+        (("state", "counters", "_steps_before"), 2**70, "_steps_before"),
+        (("state", "counters", "num_timesteps"), -1, "num_timesteps"),
+        (("state", "counters", "_current_progress_remaining"), float("nan"), "_current_progress_remaining"),
+        (("state", "modes", 0, "number"), 2**63, "modes"),
+        (("state", "modes", 0, "number"), -1, "modes"),
+        (("state", "modes", 0, "born_at"), -1, "modes"),
+        (("state", "modes", 0, "name"), "mode_77", "reserved"),
+        (("state", "modes", 0, "name"), " x", "no name"),
+        (("state", "modes", 0, "representative"), np.full((4, 1), np.nan, dtype=np.float32), "representative"),
+        (("state", "modes", 0, "representative"), np.zeros((4, 3), dtype=np.float32), "representative"),
+        ((*of_optimizer, "state", "0", "exp_avg"), np.full((16, 1), np.nan, dtype=np.float32), "exp_avg"),
+        ((*of_optimizer, "state", "0", "exp_avg_sq"), np.full((16, 1), -1.0, dtype=np.float32), "exp_avg_sq"),
+        ((*of_optimizer, "state", "0", "step"), np.array(-1e9, dtype=np.float32), "step"),
+        ((*of_optimizer, "state", "0", "exp_avg"), None, "different things"),
+        ((*of_optimizer, "groups", 0, "eps"), float("nan"), "finite"),
+        ((*of_optimizer, "groups", 0, "weight_decay"), -1.0, "weight_decay"),
+        ((*of_optimizer, "groups", 0, "betas"), {"tuple": [1.0, 1.0]}, "beta"),
+        ((*of_optimizer, "groups", 0, "betas"), {"tuple": ["x", "y"]}, "optimizer"),
+    ):
+        tree = copied(model_tree(trained))
+        shape = np.shape(tree["parameters"]["actor.optimizer"]["state"]["0"]["exp_avg"])
+        if isinstance(value, np.ndarray) and place[-1].startswith("exp"):
+            value = np.broadcast_to(value.flat[0], shape).copy()
+        _set(tree, place, value)
+        with pytest.raises(ValueError, match=said):
+            build_model(DDiffPG, tree)
+
+
 def test_names_of_other_classes_are_refused(trained, tmp_path):
     for value in (
         {"class": "os.system"},
@@ -310,8 +426,12 @@ def test_normalisation_below_another_wrapper_is_found(tmp_path):
         (("n_envs",), 0, "model.n_envs: 0 given"),
         (("arguments", "n_diffusion_steps"), 10**7, "n_diffusion_steps"),
         (("arguments", "policy_kwargs"), {"dict": {"net_arch": [0]}}, "of at least one unit each"),
-        (("observation_space",), {"kind": "Discrete", "n": [10**9, 0]}, "model.observation_space: 1000000000 inputs"),
-        (("observation_space",), {"kind": "MultiDiscrete", "n": [10**8, 10**8]}, "model.observation_space: 200000000 inputs"),
+        (("observation_space",), {"kind": "Discrete", "n": [10**9, 0]}, "accepted is .*1000000005"),
+        (("observation_space",), {"kind": "MultiDiscrete", "n": [10**8, 10**8]}, "accepted is .*200000005"),
+        (("observation_space",), {"kind": "MultiBinary", "shape": [2**24]}, "accepted is .*16777221"),
+        (("arguments", "n_action_gradient_steps"), 10**9, "n_action_gradient_steps: 1000000000 given"),
+        (("arguments", "batch_size"), 10**12, "batch_size: 1000000000000 given"),
+        (("arguments", "policy_kwargs"), {"dict": {"net_arch": [1] * 30_000}}, "30000 layers for a file of"),
     ],
 )
 def test_a_file_cannot_ask_for_sizes_that_make_no_model(trained, place, value, message):
@@ -325,18 +445,29 @@ def test_a_file_cannot_ask_for_sizes_that_make_no_model(trained, place, value, m
 
 
 def test_a_small_file_cannot_ask_for_all_of_the_memory(trained):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for name, value in (
         ("policy_kwargs", {"dict": {"net_arch": [10**6, 10**6]}}),
         ("policy_kwargs", {"dict": {"net_arch": [10**12]}}),
+        ("policy_kwargs", {"dict": {"net_arch": [30_000] * 40}}),
         ("n_atoms", 10**12),
+        ("n_atoms", 10**7),
         ("n_critics", 10**12),
         ("mode_embedding_dim", 10**12),
         ("novelty_kwargs", {"dict": {"net_arch": {"tuple": [10**6, 10**6]}}}),
     ):
         tree = read_back(trained)
         tree["arguments"][name] = value
-        with pytest.raises(ValueError, match="networks of"):
+        with pytest.raises(ValueError, match="accepted is|make no DDiffPG"):
             build_model(DDiffPG, tree)
+    tree = read_back(trained)
+    made = tree["state"]["modes"][0]
+    tree["state"]["modes"] = [{**copied(made), "number": i, "name": f"m{i}"} for i in range(3000)]
+    tree["state"]["counters"]["_next_mode_number"] = 3000
+    with pytest.raises(ValueError, match="accepted is"):
+        build_model(DDiffPG, tree)
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    assert grown < 500_000  # kB
 
 
 def test_the_file_is_readable_by_others(trained, tmp_path):

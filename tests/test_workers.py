@@ -249,3 +249,68 @@ def test_franka_in_workers():
     assert ours.get_attr("mode_features", 2)[0].tolist() == [6, 7, 8, 9]
     ours.close()
     single.close()
+
+
+def test_in_one_process_too_it_is_said_where(monkeypatch):
+    gym.register("Fragile-v0", Fragile)
+    try:
+        env = make_vec_env("Fragile-v0", 4, seed=0)
+        env.reset()
+        with pytest.raises(ZeroDivisionError) as raised:
+            env.step(np.array([[0.0], [0.0], [1.0], [0.0]]))
+        assert raised.value.__notes__ == ["Raised by environment 2"]
+        monkeypatch.setattr(Fragile, "reset", lambda *_, **__: 1 / 0)
+        with pytest.raises(ZeroDivisionError) as raised:
+            env.reset()
+        assert raised.value.__notes__ == ["Raised by environment 0"]
+    finally:
+        del gym.registry["Fragile-v0"]
+
+
+SCRIPT = """
+import sys
+from environments import TwoEnds, small_model
+from stable_baselines3.common.callbacks import BaseCallback
+from sb3_ddiffpg.checkpoints import RunCheckpointCallback
+from sb3_ddiffpg.envs.workers import WorkerVecEnv
+
+class Tells(BaseCallback):
+    def _on_step(self):
+        if self.num_timesteps == 40:
+            print("running", flush=True)
+        return True
+
+if __name__ == "__main__":
+    env = WorkerVecEnv([TwoEnds] * 4, n_workers=2)
+    if len(sys.argv) > 1:
+        small_model(env).learn(10**6, callback=[Tells(), RunCheckpointCallback(sys.argv[1], save_freq=10**6)])
+        print("saved", flush=True)
+"""
+
+
+@pytest.fixture
+def script(tmp_path):
+    path = tmp_path / "script.py"
+    path.write_text(SCRIPT)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), *sys.path])}
+
+    def start(*arguments):
+        command = [sys.executable, path, *arguments]
+        return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True, start_new_session=True)
+
+    return start
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_to_all_processes_ends_the_training_with_a_checkpoint(script, tmp_path, number):
+    """As systemd, Slurm and ``timeout`` send it."""
+    process = script(tmp_path / "run")
+    assert process.stdout.readline() == "running\n"
+    os.killpg(process.pid, number)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 0 and output.endswith("saved\n")
+    assert max(int(path.stem[-12:]) for path in (tmp_path / "run").glob("checkpoint_*")) >= 40
+
+
+def test_workers_that_nobody_closed_end_with_the_process(script):
+    assert script().wait(60) == 0

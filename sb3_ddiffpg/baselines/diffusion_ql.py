@@ -9,6 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_ddiffpg.baselines.baseline import Baseline, names_of
 from sb3_ddiffpg.baselines.dipo import DiffusionActorPolicy
 from sb3_ddiffpg.buffers import ModeBatch
+from sb3_ddiffpg.safe_files import Count
 
 
 class DiffusionQL(Baseline):
@@ -33,7 +34,7 @@ class DiffusionQL(Baseline):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(DiffusionActorPolicy)
     target_networks: ClassVar[dict[str, str]] = {"actor_target": "actor"}  # it acts by the target critics
-    _counters: ClassVar[dict[str, Any]] = {"_n_actor_updates": int}
+    _counters: ClassVar[dict[str, Any]] = {"_n_actor_updates": Count}
 
     def __init__(
         self,

@@ -24,7 +24,7 @@ from sb3_ddiffpg.baselines.entropy_tuning import EntropyTuning
 from sb3_ddiffpg.baselines.sac_c51 import GaussianActor
 from sb3_ddiffpg.baselines.world_model import WorldModel
 from sb3_ddiffpg.policy_parts import SavablePolicy, average_networks
-from sb3_ddiffpg.safe_files import check_array, convert
+from sb3_ddiffpg.safe_files import Count, check_array, convert
 from sb3_ddiffpg.twin_critic_policy import default_extractor
 
 
@@ -299,7 +299,7 @@ class RPG(EntropyTuning):
 
     default_replay_buffer_class = FifoReplayBuffer
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(RPGPolicy)
-    _counters: ClassVar[dict[str, Any]] = {"_n_model_updates": int}
+    _counters: ClassVar[dict[str, Any]] = {"_n_model_updates": Count}
     target_networks: ClassVar[dict[str, str]] = {"model_target": "model"}
     policy: RPGPolicy  # type: ignore[assignment]
 

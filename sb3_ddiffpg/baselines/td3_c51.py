@@ -12,6 +12,7 @@ from torch import nn
 
 from sb3_ddiffpg.baselines.baseline import Baseline, MlpActorPolicy, names_of
 from sb3_ddiffpg.buffers import ModeBatch
+from sb3_ddiffpg.safe_files import Count
 from sb3_ddiffpg.twin_critic_policy import Actor
 
 
@@ -69,7 +70,7 @@ class TD3C51(Baseline):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(TanhActorPolicy)
-    _counters: ClassVar[dict[str, Any]] = {"_n_critic_updates": int}
+    _counters: ClassVar[dict[str, Any]] = {"_n_critic_updates": Count}
 
     def __init__(self, policy: str | type[BasePolicy], env: Any, *, policy_delay: int = 1, **kwargs: Any) -> None:
         self.policy_delay = policy_delay

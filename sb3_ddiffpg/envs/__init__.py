@@ -8,11 +8,12 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from stable_baselines3.common.env_util import make_vec_env as make_sb3_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_ddiffpg.envs.homotopy import HomotopyTracker
 from sb3_ddiffpg.envs.mazes import LISTED_ROUTES, MAZES, Maze, reduce_word
 from sb3_ddiffpg.envs.point import PointMazeEnv, PointMazeVecEnv
+from sb3_ddiffpg.envs.turns import TurnVecEnv
 from sb3_ddiffpg.envs.workers import WorkerVecEnv
 from sb3_ddiffpg.envs.wrappers import HideGoal
 
@@ -86,13 +87,13 @@ def make_vec_env(
     if str(spec.entry_point).startswith(_FRANKA):
         # The spec, not the id: the workers do not know what was registered here
         makers: list[Any] = [partial(gym.make, spec, **env_kwargs)] * n_envs
-        workers: VecEnv = WorkerVecEnv(makers, n_threads) if n_envs > 1 else DummyVecEnv(makers)
+        workers: VecEnv = WorkerVecEnv(makers, n_threads) if n_envs > 1 else TurnVecEnv(makers)
         if seed is not None:
             workers.action_space.seed(seed)
         workers.seed(seed)
         return VecMonitor(workers)
     if spec.entry_point not in _VEC_ENVS:
-        return make_sb3_vec_env(env_id, n_envs, seed=seed, env_kwargs=env_kwargs)
+        return make_sb3_vec_env(env_id, n_envs, seed=seed, env_kwargs=env_kwargs, vec_env_cls=TurnVecEnv)
     limit = env_kwargs.pop("max_episode_steps", None) or spec.max_episode_steps
     kwargs = {"render_mode": "rgb_array", **spec.kwargs, **env_kwargs}
     threads = {} if n_threads is None or spec.entry_point == _POINT_MAZE else {"n_threads": n_threads}

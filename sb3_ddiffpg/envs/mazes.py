@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+#: Of a map: islands are found and told apart in a second then.
+MOST_CELLS = 20_000
 #: Side of a map cell, in metres.
 CELL_SIZE = 4.0
 
@@ -133,6 +135,8 @@ def _read_map(maze_map: MazeMap) -> tuple[str, ...]:
         raise ValueError(f"maze_map: there must be exactly one start 'r', but there are {n_starts}")
     if n_goals == 0:
         raise ValueError("maze_map: there must be at least one goal 'g', but there is none")
+    if len(rows) * len(rows[0]) > MOST_CELLS:
+        raise ValueError(f"maze_map: {len(rows)} x {len(rows[0])} cells given; accepted are up to {MOST_CELLS} in all")
     return rows
 
 

@@ -18,20 +18,26 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
-from sb3_ddiffpg.safe_files import check_array, convert
+from sb3_ddiffpg.safe_files import Count, check_array, convert
 
-# What each known wrapper remembers of an episode; another kind could remember anything
-_GYM_WRAPPERS: dict[type, tuple[str, ...]] = {
-    wrappers.TimeLimit: ("_elapsed_steps",),
-    wrappers.OrderEnforcing: ("_has_reset",),
-    wrappers.PassiveEnvChecker: (),
-    Monitor: ("rewards", "needs_reset"),
+
+def _plain(kind: type) -> type:
+    """The RL zoo puts a time limit of its own, which remembers the same, in the place of gymnasium's."""
+    return kind.__mro__[1] if kind.__module__ == "rl_zoo3.gym_patches" else kind
+
+
+# What each known wrapper remembers of an episode, and of which type it is; another kind could remember anything
+_GYM_WRAPPERS: dict[type, dict[str, Any]] = {
+    _plain(wrappers.TimeLimit): {"_elapsed_steps": Count | None},
+    wrappers.OrderEnforcing: {"_has_reset": bool},
+    wrappers.PassiveEnvChecker: {},
+    Monitor: {"rewards": list[float], "needs_reset": bool},
 }
-_VEC_WRAPPERS: dict[type, tuple[str, ...]] = {
-    VecMonitor: ("episode_returns", "episode_lengths", "episode_count"),
-    VecNormalize: ("returns",),
-    VecTransposeImage: (),
-    VecCheckNan: (),
+_VEC_WRAPPERS: dict[type, dict[str, Any]] = {
+    VecMonitor: {"episode_returns": np.ndarray, "episode_lengths": np.ndarray, "episode_count": Count},
+    VecNormalize: {"returns": np.ndarray},
+    VecTransposeImage: {},
+    VecCheckNan: {},
 }
 
 
@@ -80,7 +86,7 @@ def restore_env(env: gym.Env, tree: Any) -> None:
         raise ValueError(f"environment: saved of another than {type(core).__name__}")
     for wrapper, values in layers:
         for name, value in values.items():
-            setattr(wrapper, name, value)
+            setattr(wrapper, name, convert(value, _GYM_WRAPPERS[_plain(type(wrapper))][name], f"environment.{name}"))
         if isinstance(wrapper, wrappers.PassiveEnvChecker):  # it checks first calls, which others were
             wrapper.checked_reset = wrapper.checked_step = wrapper.checked_data_reuse = True
     core.load_state_dict(snapshot.core)
@@ -103,6 +109,16 @@ def vec_env_snapshot(env: VecEnv) -> dict[str, Any] | None:
     return {"layers": layers, "core": core} if known else None
 
 
+def awaits_seeds(env: VecEnv) -> bool:
+    """
+    :param env: Vectorised environments
+    :return: Whether they have been given seeds that the first reset will take, which no snapshot holds
+    """
+    while isinstance(env, VecEnvWrapper):
+        env = env.venv
+    return any(seed is not None for seed in env._seeds)
+
+
 def restore_vec_env(env: VecEnv, tree: Any) -> None:
     """
     :param env: Made as the one that was asked
@@ -113,13 +129,10 @@ def restore_vec_env(env: VecEnv, tree: Any) -> None:
     layers, core = _match(env, snapshot, "venv", _VEC_WRAPPERS, "environments")
     for wrapper, values in layers:
         for name, value in values.items():
-            before = getattr(wrapper, name)
-            if isinstance(before, np.ndarray):
-                array = convert(value, np.ndarray, name)
-                value = check_array(array, before.dtype, before.shape, f"environments.{name}").copy()
-            else:
-                value = convert(value, type(before), f"environments.{name}")
-            setattr(wrapper, name, value)
+            before, found = getattr(wrapper, name), convert(value, _VEC_WRAPPERS[type(wrapper)][name], f"environments.{name}")
+            if isinstance(found, np.ndarray):
+                found = check_array(found, before.dtype, before.shape, f"environments.{name}").copy()
+            setattr(wrapper, name, found)
     if isinstance(core, DummyVecEnv):
         states = convert(snapshot.core, list[Any], "environments")
         if len(states) != core.num_envs:
@@ -135,26 +148,27 @@ def restore_vec_env(env: VecEnv, tree: Any) -> None:
         raise ValueError(f"environments: saved of another kind than {type(core).__name__}")
 
 
-def _peel(env: Any, wrapper: type, inner: str, known: dict[type, tuple[str, ...]]) -> tuple[list[dict[str, Any]], Any] | None:
+def _peel(env: Any, wrapper: type, inner: str, known: dict[type, dict[str, Any]]) -> tuple[list[dict[str, Any]], Any] | None:
     """What each wrapper remembers, from the outermost on, and what is within; None if one is not known."""
     layers = []
     while isinstance(env, wrapper):
-        if type(env) not in known:
+        kind = _plain(type(env))
+        if kind not in known:
             return None
-        values = {name: getattr(env, name) for name in known[type(env)]}
-        layers.append({"kind": type(env).__name__, "values": values})
+        layers.append({"kind": kind.__name__, "values": {name: getattr(env, name) for name in known[kind]}})
         env = getattr(env, inner)
     return layers, env
 
 
 def _match(
-    env: Any, snapshot: _Snapshot, inner: str, known: dict[type, tuple[str, ...]], what: str
+    env: Any, snapshot: _Snapshot, inner: str, known: dict[type, dict[str, Any]], what: str
 ) -> tuple[list[tuple[Any, dict[str, Any]]], Any]:
     """Each wrapper with what one of its kind remembered, and what is within."""
     layers = []
     for layer in snapshot.layers:
-        if type(env).__name__ != layer.kind or set(layer.values) != set(known.get(type(env), ())):
-            raise ValueError(f"{what}: saved with a {layer.kind} where there is a {type(env).__name__}")
+        kind = _plain(type(env))
+        if kind not in known or kind.__name__ != layer.kind or set(layer.values) != set(known[kind]):
+            raise ValueError(f"{what}: saved with a {layer.kind[:50]} where there is a {kind.__name__}")
         layers.append((env, layer.values))
         env = getattr(env, inner)
     return layers, env

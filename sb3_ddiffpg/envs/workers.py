@@ -1,13 +1,15 @@
 """Environments in a few worker processes, several in each, for simulators that step one environment at a time."""
 
+import contextlib
 import math
 import multiprocessing
 import os
 import signal
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from multiprocessing.connection import Connection, wait
+from multiprocessing.util import Finalize
 from typing import Any, NoReturn
 
 import gymnasium as gym
@@ -16,6 +18,7 @@ from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv, Ve
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_ddiffpg.envs.snapshots import env_snapshot, restore_env
+from sb3_ddiffpg.envs.turns import Turns
 from sb3_ddiffpg.interrupts import uninterrupted
 from sb3_ddiffpg.safe_files import convert
 
@@ -31,25 +34,11 @@ def n_processors() -> int:
 _NOBODY = -1
 
 
-class _Turns(list):
-    """Environments of a worker. Whose turn it was last can be seen by the parent, even if it never comes back."""
-
-    def __init__(self, envs: Sequence[gym.Env], turn: Any) -> None:
-        super().__init__(envs)
-        self.turn = turn
-
-    def __getitem__(self, index: Any) -> Any:
-        self.turn.value = index
-        return super().__getitem__(index)
-
-    def __iter__(self) -> Iterator[gym.Env]:
-        return (self[index] for index in range(len(self)))
-
-
 def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper, turn: Any) -> None:
     """What a worker does: it answers each command with ``("ok", result)`` or ``("error", (environment, error, text))``."""
     parent.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent says what happens now
+    for number in (signal.SIGINT, signal.SIGTERM):  # they may reach all processes; the parent says what happens now
+        signal.signal(number, signal.SIG_IGN)
     envs: DummyVecEnv | None = None
     while True:
         try:
@@ -78,7 +67,7 @@ def _make(env_fns: Sequence[Callable[[], gym.Env]], turn: Any) -> DummyVecEnv:
         turn.value = env_idx
         made.append(make())
     envs = DummyVecEnv([partial(made.__getitem__, i) for i in range(len(made))])
-    envs.envs = _Turns(made, turn)
+    envs.envs = Turns(made, turn)
     return envs
 
 
@@ -102,6 +91,19 @@ def _answer(envs: Any, command: str, argument: Any) -> Any:
     for env_idx in indices:
         answers.append((getattr(envs, name)(*arguments, **keywords, indices=[env_idx]) or [None])[0])
     return answers
+
+
+def _end(remotes: Sequence[Connection], processes: Sequence[Any]) -> None:
+    for remote in remotes:
+        with contextlib.suppress(OSError):  # gone already
+            remote.send(("close", None))
+    for process in processes:
+        process.join(timeout=5)
+        if process.is_alive():
+            process.kill()
+            process.join()
+    for remote in remotes:
+        remote.close()
 
 
 class WorkerVecEnv(VecEnv):
@@ -132,9 +134,8 @@ class WorkerVecEnv(VecEnv):
         n_workers = min(n_workers, len(env_fns))
         #: First environment of each worker, and the number of environments
         self.first = np.linspace(0, len(env_fns), n_workers + 1).round().astype(int)
-        # Not fork: simulators and networks have threads by then
-        methods = multiprocessing.get_all_start_methods()
-        context: Any = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
+        # Not fork: simulators and networks have threads by then. No server that forks: a signal to all would end it, and them
+        context: Any = multiprocessing.get_context("spawn")
         self.remotes: list[Connection] = []
         self.processes: list[Any] = []
         self._turns: list[Any] = []
@@ -151,6 +152,8 @@ class WorkerVecEnv(VecEnv):
             theirs.close()
             self.remotes.append(remote)
             self.processes.append(process)
+        # At the end of this process, before it waits for its daemons, which do not listen to its signals
+        self._ending = Finalize(self, _end, (self.remotes, self.processes), exitpriority=10)
         #: Answers that each worker still owes
         self._owed = [0] * n_workers
         observation_space, action_space, self.render_mode = self._ask("make", [None] * n_workers)[0]
@@ -280,18 +283,7 @@ class WorkerVecEnv(VecEnv):
         if self._closed:
             return
         self._closed = True
-        for remote in self.remotes:
-            try:
-                remote.send(("close", None))
-            except OSError:
-                pass  # gone already
-        for process in self.processes:
-            process.join(timeout=5)
-            if process.is_alive():
-                process.kill()
-                process.join()
-        for remote in self.remotes:
-            remote.close()
+        self._ending()
 
     def _each(self, name: str, indices: VecEnvIndices, *arguments: Any, **keywords: Any) -> list[Any]:
         """Call a method of the workers' ``DummyVecEnv`` for some environments, which are given it as ``indices``."""

@@ -41,7 +41,7 @@ def read_yaml(name: str, path: Path) -> Any:
     """
     try:
         return parse_yaml(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{name}: {path} is no YAML: {error}") from None
 
 

@@ -3,6 +3,7 @@
 import importlib
 import math
 import re
+import reprlib
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,7 @@ class Trial(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
         counts |= {name: getattr(self.tests, name) for name in ("n_tests", "n_test_episodes", "n_episodes")}
         for name, value in counts.items():
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 1 <= value < math.inf:
-                raise ValueError(f"{name}: {value!r} given; accepted are numbers from 1 up")
+                raise ValueError(f"{name}: {reprlib.repr(value)} given; accepted are numbers from 1 up")
         if counts["n_timesteps"] < self.members:
             raise ValueError(
                 f"members: {self.members} given for {counts['n_timesteps']:g} steps; accepted is one step for each"
@@ -93,7 +94,9 @@ class Trial(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
                 raise ValueError(f"{name}: given beside also or members, whose environments are tested as they are")
         env_kwargs = self.hyperparams.get("env_kwargs", {})
         if not isinstance(env_kwargs, dict):
-            raise ValueError(f"env_kwargs: {env_kwargs!r} given; accepted are arguments of the environment by name")
+            raise ValueError(
+                f"env_kwargs: {reprlib.repr(env_kwargs)} given; accepted are arguments of the environment by name"
+            )
         spaces, *others = (_spaces_of(env_id, yaml.safe_dump(env_kwargs)) for env_id in (self.env, *self.tests.also))
         for env_id, other in zip(self.tests.also, others, strict=True):
             if not all(map(_alike, other, spaces)):

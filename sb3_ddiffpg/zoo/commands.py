@@ -89,6 +89,8 @@ def train(arguments: Sequence[str]) -> None:
     if path is not None and not Path(path).is_file() and not _is_module(str(path)):
         ours = sorted(each.stem for each in config_file(ALGO).parent.glob("*.yml"))  # type: ignore[union-attr]
         raise SystemExit(f"--conf-file: {known.conf_file!r} given; accepted are a YAML or Python file, a module, and {ours}")
+    if known.resume is not None and known.hyperparams:
+        print("--resume: the run goes on with its own settings, not with what --hyperparams says")
     resume = None if known.resume is None else _run_folder(known.resume, known.log_folder, known.algo, known.env)
     manager = partial(ModeExperimentManager, checkpoint_freq=known.checkpoint_freq, resume=resume)
     rest += ["--log-folder", known.log_folder]

@@ -8,11 +8,12 @@ from typing import Any
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import SimpleLinearSchedule
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.checkpoints import RunCheckpointCallback
 from sb3_ddiffpg.envs import is_ours, make_vec_env
+from sb3_ddiffpg.envs.turns import TurnVecEnv
 from sb3_ddiffpg.schedules import LateLinearSchedule
 from sb3_ddiffpg.zoo.settings import ALGO, ALGOS, check_hyperparameters
 
@@ -32,6 +33,8 @@ class ModeExperimentManager(ExperimentManager):
         self.is_own = self.algo == ALGO or self.algo in BASELINES
         if self.is_own:
             self.deterministic_eval = False
+        if self.vec_env_class is DummyVecEnv:
+            self.vec_env_class = TurnVecEnv  # which says where an error was raised
         if resume is not None:
             self.continue_training = True  # with what ``_load_pretrained_agent`` gives
             self.save_path = str(resume)
