@@ -220,7 +220,7 @@ def plot_exploration(visits: VisitMap | None, maze: Any = None) -> Figure:
     figure = _new(11, 4.6)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     image = draw_visits(left, visits, maze)
-    figure.colorbar(image, ax=left, label=f"visits (from {usual_visits(visits):.3g} on alike)", extend="max")
+    figure.colorbar(image, ax=left, label=f"visits (from {usual_visits(visits):,.0f} on alike)", extend="max")
     right.plot(*np.array(visits.coverage or [(0, 0)]).T)
     _count_steps(right)
     right.set(ylabel=f"known cells of {visits.cell_size:g} m", ylim=(0, None))

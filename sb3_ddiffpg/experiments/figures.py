@@ -187,7 +187,7 @@ class Maps:
         for axes, (variant, visits) in zip(panels, visited.items(), strict=True):
             image = plots.draw_visits(axes, visits, self.maze, most)
             axes.set_title(f"{variant}: {len(visits)} cells")
-        figure.colorbar(image, ax=panels, label=f"visits (from {most:.3g} on alike)", extend="max")
+        figure.colorbar(image, ax=panels, label=f"visits (from {most:,.0f} on alike)", extend="max")
         return figure
 
     def values(self) -> Figure | None:

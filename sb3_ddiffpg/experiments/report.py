@@ -21,7 +21,7 @@ from sb3_ddiffpg.experiments import figures
 from sb3_ddiffpg.experiments.files import check_output
 from sb3_ddiffpg.experiments.record import command_line
 from sb3_ddiffpg.experiments.store import Recorded, by, check_alike, read_results, task_of, variant_of
-from sb3_ddiffpg.experiments.summary import elsewhere_table, task_table
+from sb3_ddiffpg.experiments.summary import elsewhere_table, seconds_per_update, task_table
 from sb3_ddiffpg.zoo import register
 
 _IMAGE = re.compile(r'src="([^":]+\.png)"')
@@ -46,6 +46,8 @@ def make_report(
     runs, incomplete = read_results(results)
     if suite is not None:
         runs = [run for run in runs if task_of(run) in suite[0] and variant_of(run) in suite[1]]
+        places = {(task.replace("/", "-"), variant) for task in suite[0] for variant in suite[1]}
+        incomplete = [folder for folder in incomplete if folder.relative_to(results).parts[:2] in places]
     if not runs:
         raise ValueError(f"results: none of the {len(incomplete)} trainings in {results} is complete")
     check_alike(runs)
@@ -122,7 +124,7 @@ def _draw(drawn: _Drawn, runs: Sequence[Recorded], setting: str | None) -> None:
         drawn.add("aggregate", f"Interquartile means of the {scope}, stratified bootstrap.", figures.aggregate(runs))
     if setting is not None:
         drawn.add("ablation", f"The models of the tables over {setting}.", figures.ablation(runs, setting))
-    if any(run.result.get("seconds") for run in runs):
+    if any(seconds_per_update(run) is not None for run in runs):
         drawn.add("wall_clock", "Time of 1000 updates and the collection between them, by part.", figures.wall_clock(runs))
     for task, own in by(task_of, runs).items():
         maps = figures.Maps(own)
