@@ -278,6 +278,27 @@ def test_a_runner_that_is_killed_leaves_no_process(tiny, tmp_path, start):
     _wait_for(lambda: not [line for line in _processes() if str(tmp_path) in line], 60)
 
 
+def test_a_suite_that_is_killed_goes_on_and_repeats_nothing(tiny, tmp_path, start, capsys):
+    """The runner and what it runs, all by SIGKILL, when one of two trials is complete."""
+    tiny.write_text(TINY.replace("n_timesteps: 1600", "n_timesteps: 6000"))
+    out = tmp_path / "out"
+    arguments = ["run", str(tiny), "--out", str(out), "--workers", "1", "--no-report"]
+    process = start([sys.executable, "-m", "sb3_ddiffpg.experiments", *arguments])
+    first, second = (out / place for place in read_suite(str(tiny)).trials())
+    _wait_for(lambda: is_complete(first) and _checkpoints(second), 240)
+    trials = [int(line.split()[0]) for line in _processes() if " trial " in line and str(out) in line]
+    for number in (process.pid, *trials):
+        os.kill(number, signal.SIGKILL)
+    process.wait()
+    assert trials and not is_complete(second)
+    before = {path: path.stat().st_mtime_ns for path in first.rglob("*") if path.is_file()}
+    cli.main(arguments)
+    assert "1 of 2 trials to run" in capsys.readouterr().out and is_complete(second)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    steps = (second / "logs" / "output.log").read_text().split("Going on at step ")[1].split()[0]
+    assert int(steps) > 0 and not list(second.rglob("checkpoint_*"))
+
+
 def test_progress_that_cannot_be_written_or_read(tmp_path):
     assert read_progress(tmp_path) is None
     write_progress(tmp_path, Progress(5, 10))

@@ -3,6 +3,7 @@
 import argparse
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
@@ -17,8 +18,9 @@ from rich.progress import Progress as Bars
 
 from sb3_ddiffpg.experiments.execution import Executor, LocalExecutor, RayExecutor, TrialFailed
 from sb3_ddiffpg.experiments.files import check_output
+from sb3_ddiffpg.experiments.machine import git_commit
 from sb3_ddiffpg.experiments.progress import read_progress
-from sb3_ddiffpg.experiments.record import check_folder, has_record, is_complete
+from sb3_ddiffpg.experiments.record import check_folder, has_record, is_complete, read_record
 from sb3_ddiffpg.experiments.suite import Suite, read_suite, suite_names
 from sb3_ddiffpg.experiments.trial import Trial
 
@@ -170,6 +172,10 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
     check_output(folder)
     missing = missing_trials(suite, folder)
     print(f"{suite.description}\n{len(missing)} of {suite.n_trials} trials to run", flush=True)
+    commits = Counter(read_record(folder / place).get("git_commit") for place in suite.trials().keys() - missing.keys())
+    others = ", ".join(f"{n} of commit {commit}" for commit, n in commits.items() if commit != git_commit())
+    if others:
+        print(f"What is complete already is not of this commit ({git_commit()}): {others}", flush=True)
     if given.list:
         return partial(print, *missing, sep="\n", end="\n" if missing else "")
     return partial(_run, given, suite, folder, bool(missing))
