@@ -27,6 +27,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_ddiffpg.buffer_state import buffer_state, restore_buffer
 from sb3_ddiffpg.envs.snapshots import awaits_seeds, restore_vec_env, vec_env_snapshot
 from sb3_ddiffpg.model_file import model_tree
+from sb3_ddiffpg.noise import check_noise
 from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
 from sb3_ddiffpg.rng import global_rng, preserved_rng, restore_global_rng
 from sb3_ddiffpg.safe_files import check_array, convert, read, remove_unfinished, write
@@ -146,9 +147,8 @@ class InterruptedRun:
         with preserved_rng():
             restore_global_rng(run.random)  # or it would be known only when ``learn`` has begun
         noise = self._noise(model)
-        size = int(np.prod(model.action_space.shape))  # of one environment's, until ``learn`` makes one for each of it
-        if noise is not None and np.size(copy.deepcopy(noise)()) not in (size, size * model.n_envs):
-            raise ValueError(f"noise: of another size than {model.n_envs} actions")
+        if noise is not None:
+            check_noise(noise, model.n_envs, int(np.prod(model.action_space.shape)))
         model.load_episodes_tree(run.episodes)
         restore_buffer(model.replay_buffer, run.buffer)
         model.ep_info_buffer = deque(run.episode_infos, maxlen=model._stats_window_size)
@@ -183,8 +183,6 @@ class InterruptedRun:
             noise = from_plain(copy.deepcopy(self.run.noise))  # it changes its arrays
         except NeededError:  # one's own kind: custom_objects had it
             return model.action_noise
-        if noise is not None and not isinstance(noise, ActionNoise):
-            raise ValueError(f"noise: {str(noise)[:100]!r} is none")
         return noise
 
 

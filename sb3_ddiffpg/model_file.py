@@ -14,6 +14,7 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_ddiffpg.envs.snapshots import normalization, restore_normalization
+from sb3_ddiffpg.noise import check_noise
 from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
 from sb3_ddiffpg.rng import preserved_rng
 from sb3_ddiffpg.safe_files import check_array, convert
@@ -160,6 +161,8 @@ def build_model(
         model._in_file = saved.parameters
         model._setup_model()
         model._in_file = None
+        if model.action_noise is not None:
+            check_noise(model.action_noise, model.n_envs, int(np.prod(action_space.shape)))
         parameters = _parameters(model, saved.parameters)
         model.set_parameters(parameters, exact_match=True, device=model.device)
     except (TypeError, AttributeError, AssertionError, LookupError, RuntimeError, ArithmeticError, MemoryError) as error:

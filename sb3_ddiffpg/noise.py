@@ -1,9 +1,11 @@
 """Exploration noise."""
 
+import copy
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
-from stable_baselines3.common.noise import VectorizedActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 
 
 class SpreadNormalActionNoise(VectorizedActionNoise):
@@ -42,3 +44,27 @@ class SpreadNormalActionNoise(VectorizedActionNoise):
 
     def __repr__(self) -> str:
         return f"SpreadNormalActionNoise(low={self.low}, high={self.high})"
+
+
+def check_noise(noise: Any, n_envs: int, size: int) -> None:
+    """
+    :param noise: Whose attributes come from a file
+    :param n_envs: Number of environments
+    :param size: Size of an action; the noise may be for one environment, until ``learn`` makes one for each of it
+    :raises ValueError: If it draws nothing that can be added to actions
+    """
+    if not isinstance(noise, ActionNoise):
+        raise ValueError(f"noise: {str(noise)[:100]!r} is none")
+    if isinstance(noise, SpreadNormalActionNoise) and getattr(noise, "shape", None) != (n_envs, size):
+        raise ValueError(f"noise: of another shape than {n_envs} actions of size {size}")
+    before = np.random.get_state()
+    try:
+        tried = copy.deepcopy(noise)
+        tried.reset()
+        drawn = np.asarray(tried(), dtype=np.float64)
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError) as error:
+        raise ValueError(f"noise: it draws nothing: {error!r}") from None
+    finally:
+        np.random.set_state(before)
+    if drawn.size not in (size, size * n_envs) or not np.isfinite(drawn).all():
+        raise ValueError(f"noise: what it draws is no noise for {n_envs} actions")

@@ -220,7 +220,10 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         _, checkpoint = read_checkpoint(path)
         model = build_model(cls, checkpoint.model, env, device, custom_objects, **kwargs)
         model._interrupted = InterruptedRun(checkpoint.run)
-        model._interrupted.restore_buffer_and_environments(model)
+        try:
+            model._interrupted.restore_buffer_and_environments(model)
+        except (TypeError, AttributeError, LookupError, ArithmeticError, MemoryError) as error:
+            raise ValueError(f"checkpoint: it does not fit the model that its settings make: {error!r}") from error
         return model
 
     def _built(self, part: str, make: Callable[..., Built], *args: Any, **kwargs: Any) -> Built:

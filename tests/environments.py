@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 
 from sb3_ddiffpg import DDiffPG, ModeReplayBuffer
+from sb3_ddiffpg.rng import restore_generator
 
 SMALL: dict[str, Any] = {
     "learning_starts": 40,
@@ -56,6 +57,19 @@ class TwoEnds(gym.Env):
         reached = abs(self.x) >= 1
         info = {} if self.success_key is None else {self.success_key: reached}
         return self._observation(), float(reached), reached, self.steps >= self.limit, info
+
+
+class KnownEnds(TwoEnds):
+    """``TwoEnds`` that can say where its episode is."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"x": self.x, "steps": self.steps, "random": self.np_random.bit_generator.state}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        if not (isinstance(state["x"], float) and abs(state["x"]) < 2 and state["steps"] in range(self.limit)):
+            raise ValueError("an episode cannot be there")
+        self.x, self.steps = state["x"], state["steps"]
+        restore_generator(self.np_random, state["random"])
 
 
 class AnySpaces(gym.Env):

@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 import torch as th
-from environments import SMALL, TwoEnds, assert_same_state, copied, state_of
+from environments import SMALL, KnownEnds, TwoEnds, assert_same_state, copied, state_of
 from filelock import FileLock
 from rl_zoo3 import gym_patches
 from stable_baselines3.common.callbacks import (
@@ -32,21 +32,10 @@ from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.checkpoints import KIND, RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.envs.snapshots import env_snapshot, restore_env
-from sb3_ddiffpg.rng import global_rng, restore_generator, restore_global_rng
+from sb3_ddiffpg.rng import global_rng, restore_global_rng
 from sb3_ddiffpg.safe_files import read, write
 
 END = 560
-
-
-class KnownEnds(TwoEnds):
-    """``TwoEnds`` that can say where its episode is."""
-
-    def state_dict(self):
-        return {"x": self.x, "steps": self.steps, "random": self.np_random.bit_generator.state}
-
-    def load_state_dict(self, state):
-        self.x, self.steps = state["x"], state["steps"]
-        restore_generator(self.np_random, state["random"])
 
 
 def known_ends(n_envs=4):
@@ -639,6 +628,10 @@ def test_runs_that_contradict_themselves_are_refused(tmp_path):
     for change, said in (
         (lambda run: run["environments"]["layers"].append({"kind": "DummyVecEnv", "values": {}}), "saved with a DummyVecEnv"),
         (lambda run: run.update(noise="hello"), "noise: 'hello' is none"),
+        (lambda run: run["noise"]["state"].update(low=None), "noise: it draws nothing"),
+        (lambda run: run["noise"]["state"].pop("low"), "noise: it draws nothing"),
+        (lambda run: run["noise"]["state"].update(shape={"tuple": [10**12, 1]}), "noise: of another shape"),
+        (lambda run: run["noise"]["state"].update(high=float("nan")), "noise: "),
         (lambda run: run["episodes"].update(groups=np.zeros(7, dtype=np.int64)), "behavior"),
         (lambda run: run.update(last_obs=np.zeros((4, 3), dtype=np.float32)), "last_obs"),
         (lambda run: run.update(last_obs=np.full((4, 2), np.nan, dtype=np.float32)), "last_obs"),

@@ -5,6 +5,7 @@ same tests with inputs that a fuzzer makes, many more of them.
 
 import json
 import tempfile
+import warnings
 from functools import cache
 from pathlib import Path
 
@@ -12,15 +13,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
-from environments import TwoEnds, copied, small_model
+from environments import KnownEnds, TwoEnds, copied, small_model
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.buffer_state import buffer_state, restore_buffer
+from sb3_ddiffpg.checkpoints import KIND, RunCheckpointCallback, checkpoint_files
+from sb3_ddiffpg.divergence import DivergedError
 from sb3_ddiffpg.dtw import dtw_distances
 from sb3_ddiffpg.envs.mazes import Maze
 from sb3_ddiffpg.evaluation import evaluate_modes
@@ -28,7 +32,7 @@ from sb3_ddiffpg.experiments.suite import read_suite
 from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 from sb3_ddiffpg.model_file import build_model, model_tree
 from sb3_ddiffpg.modes import ModeTable
-from sb3_ddiffpg.safe_files import read
+from sb3_ddiffpg.safe_files import read, write
 
 MANY = settings(max_examples=40, deadline=None)
 
@@ -106,7 +110,44 @@ def test_a_model_with_something_else_in_it(data):
     except ValueError as error:
         assert str(error)
         return
-    assert len(model.predict(np.zeros((2, 2), dtype=np.float32))[0]) == 2
+    actions = model.predict(np.zeros((2, 2), dtype=np.float32))[0]
+    assert actions.shape == (2, 1) and (np.abs(actions) <= 1).all()
+
+
+@cache
+def interrupted() -> dict:
+    """A checkpoint in the midst of episodes, as it is read."""
+    model = small_model(DummyVecEnv([KnownEnds] * 4), buffer_size=400)
+    model.learn(300, callback=RunCheckpointCallback(folder() / "run", save_freq=100))
+    return read(checkpoint_files(folder() / "run")[0], KIND)
+
+
+@given(data=st.data())
+@MANY
+def test_a_checkpoint_with_something_else_in_it(data):
+    """It is refused when it is read, or the run goes on, or training says what is wrong; no parameter takes any harm."""
+    tree = copied(interrupted())
+    for _ in range(data.draw(st.integers(1, 3))):
+        mutate(tree, data)
+    path = folder() / "changed.safetensors"
+    write(path, KIND, tree)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            model = DDiffPG.resume(path, DummyVecEnv([KnownEnds] * 4))
+        except ValueError as error:
+            assert str(error)
+            return
+        model.set_logger(Logger(None, []))
+        for name, most in (("batch_size", 10**4), ("gradient_steps", 10), ("n_action_gradient_steps", 10), ("train_freq", 10)):
+            value = getattr(model, name)  # longer than a test may take
+            assume(not isinstance(value, int) or value <= most)
+        try:
+            model.learn(model.num_timesteps - model._learn_began_at + 40)
+        except (DivergedError, ValueError) as error:  # such as of another success_key
+            assert str(error)
+    for parameter in model.policy.parameters():
+        assert parameter.isfinite().all()
 
 
 @given(data=st.data())

@@ -89,7 +89,10 @@ def restore_env(env: gym.Env, tree: Any) -> None:
             setattr(wrapper, name, convert(value, _GYM_WRAPPERS[_plain(type(wrapper))][name], f"environment.{name}"))
         if isinstance(wrapper, wrappers.PassiveEnvChecker):  # it checks first calls, which others were
             wrapper.checked_reset = wrapper.checked_step = wrapper.checked_data_reuse = True
-    core.load_state_dict(snapshot.core)
+    try:
+        core.load_state_dict(snapshot.core)
+    except (LookupError, TypeError, AttributeError) as error:  # somebody's own may trust what it is given
+        raise ValueError(f"environment: {type(core).__name__} cannot be there: {error!r}") from error
 
 
 def vec_env_snapshot(env: VecEnv) -> dict[str, Any] | None:
