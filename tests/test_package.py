@@ -96,6 +96,66 @@ def test_import_is_cheap(installed):
     assert run_installed(installed, code) == "[]"
 
 
+# Imports a module as if nothing else were installed than what these extras ask for
+WITHOUT_OTHERS = """
+import importlib, sys
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+wanted, module = sys.argv[1].split(","), sys.argv[2]
+known, waiting = set(), [("sb3_ddiffpg", extra) for extra in ["", *wanted]]
+while waiting:
+    name, extra = waiting.pop()
+    if (canonicalize_name(name), extra) in known:
+        continue
+    known.add((canonicalize_name(name), extra))
+    try:
+        lines = requires(name) or []
+    except PackageNotFoundError:
+        continue
+    for requirement in map(Requirement, lines):
+        if requirement.marker is None or requirement.marker.evaluate({"extra": extra}):
+            waiting += [(requirement.name, each) for each in ["", *requirement.extras]]
+installed = {name for name, _ in known}
+others = {
+    top
+    for top, distributions in packages_distributions().items()
+    if not any(canonicalize_name(each) in installed for each in distributions)
+}
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in others:
+            raise ModuleNotFoundError(f"No module named {name!r} where only {wanted} are installed", name=name)
+
+sys.meta_path.insert(0, Absent())
+for name in [name for name in sys.modules if name.split(".")[0] in others]:
+    del sys.modules[name]
+importlib.import_module(module)
+"""
+
+
+@pytest.mark.parametrize(
+    ("extras", "module"),
+    [
+        ("", "sb3_ddiffpg"),
+        ("", "sb3_ddiffpg.checkpoints"),
+        ("zoo", "sb3_ddiffpg.zoo"),
+        ("plots", "sb3_ddiffpg.plots"),
+        ("plots", "sb3_ddiffpg.report"),
+        ("zoo,plots", "sb3_ddiffpg.experiments.training"),
+        ("zoo,plots", "sb3_ddiffpg.experiments.run"),
+        ("zoo,plots", "sb3_ddiffpg.experiments.report"),
+        ("zoo,plots,hub", "sb3_ddiffpg.experiments.card"),
+    ],
+)
+def test_extras_are_enough(extras, module):
+    """What tests and other extras bring along must not hide what is missing."""
+    done = subprocess.run([sys.executable, "-c", WITHOUT_OTHERS, extras, module], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_one_version(config):
     version = config["metadata"]["version"]
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version
