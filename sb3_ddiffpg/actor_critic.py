@@ -576,9 +576,12 @@ class NoveltyActorCritic(SavableAlgorithm):
         new_episodes = reset_num_timesteps or self._last_obs is None
         if new_episodes:
             self.replay_buffer.drop_unfinished_episodes()
+        steps = self.num_timesteps
         total_timesteps, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        if self.num_timesteps < steps:  # counted anew
+            self._steps_before += steps
         # What an earlier run left behind would end the exploration of this one's first episodes
         self._update_current_progress_remaining(self.num_timesteps, max(total_timesteps, 1))
         if new_episodes:

@@ -1,5 +1,6 @@
 """Checkpoints of a whole run: written so that no crash loses the one before, and from which it goes on bit for bit."""
 
+import contextlib
 import copy
 import errno
 import signal
@@ -30,7 +31,7 @@ from sb3_ddiffpg.model_file import model_tree
 from sb3_ddiffpg.noise import check_noise
 from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
 from sb3_ddiffpg.rng import global_rng, preserved_rng, restore_global_rng
-from sb3_ddiffpg.safe_files import check_array, convert, read, remove_unfinished, write
+from sb3_ddiffpg.safe_files import DamagedError, check_array, convert, read, remove_unfinished, write
 
 #: What the file says it is
 KIND = "checkpoint"
@@ -223,7 +224,8 @@ def _gathered(callback: BaseCallback) -> list[str]:
 def _callback_state(callback: BaseCallback) -> dict[str, Any]:
     state: dict[str, Any] = {"n_calls": callback.n_calls}
     if isinstance(tests := getattr(callback, "eval_env", None), VecEnv) and not awaits_seeds(tests):
-        state["eval_env"] = vec_env_snapshot(tests)  # so that further tests draw as they would have
+        with contextlib.suppress(Exception):  # one that was never reset may not know where it is
+            state["eval_env"] = vec_env_snapshot(tests)  # so that further tests draw as they would have
     state.update({name: getattr(callback, name) for name in _gathered(callback)})
     if hasattr(callback, "state_dict"):
         state["own"] = callback.state_dict()
@@ -238,21 +240,28 @@ def _load_callback_state(callback: BaseCallback, state: dict[str, Any]) -> None:
             raise ValueError(f"callback.{name}: {str(value)[:100]} given, where {getattr(callback, name)!r} was")
         setattr(callback, name, value)
     if isinstance(tests := getattr(callback, "eval_env", None), VecEnv) and state.get("eval_env") is not None:
-        restore_vec_env(tests, state["eval_env"])
+        try:
+            restore_vec_env(tests, state["eval_env"])
+        except ValueError as error:
+            warnings.warn(f"{type(callback).__name__} tests in other environments than before: {error}")
     if hasattr(callback, "load_state_dict") and "own" in state:
         callback.load_state_dict(state["own"])
 
 
-def _refuse_another_run(folder: Path, run_id: str, n_steps: int) -> None:
+def _refuse_another_run(folder: Path, run_id: str, n_steps: int) -> list[Path]:
     """
     What has come furthest is the newest, so that a second run in a folder would be lost beside a longer first one, and so
-    would one that goes on from an older checkpoint.
+    would one that goes on from an older checkpoint. Gives back what is damaged.
     """
+    damaged: list[Path] = []
     for path in checkpoint_files(folder):
         try:
             found = read_checkpoint(path)[1].model.get("state", {}).get("counters", {}).get("run_id")
-        except (ValueError, OSError, AttributeError):
-            continue  # damaged, and passed over by ``resume`` too
+        except DamagedError:
+            damaged.append(path)  # passed over by ``resume`` too
+            continue
+        except OSError:
+            continue
         if found != run_id:
             raise ValueError(
                 f"folder: {folder} holds checkpoints of another run ({path.name}): resume that one, or name another folder"
@@ -262,7 +271,8 @@ def _refuse_another_run(folder: Path, run_id: str, n_steps: int) -> None:
                 f"folder: {folder} holds a checkpoint that is further than step {n_steps} ({path.name}): resume that one, "
                 "remove it, or name another folder"
             )
-        return
+        break
+    return damaged
 
 
 def _n_steps(path: Path) -> int:
@@ -300,12 +310,14 @@ class RunCheckpointCallback(BaseCallback):
         self._signal: int | None = None
         self._stopped = False
         self._first = True
+        self._damaged: list[Path] = []
 
     def _on_training_start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._hold_folder()
         remove_unfinished(self.folder, NAMES)
-        _refuse_another_run(self.folder, self.model.run_id, self._lifetime_steps())  # type: ignore[attr-defined]
+        model: Any = self.model
+        self._damaged = _refuse_another_run(self.folder, model.run_id, model.lifetime_steps)
         if vec_env_snapshot(self.training_env) is None:
             warnings.warn("These environments cannot be saved in the middle of an episode: a run that goes on begins new ones")
         self._last, self._signal, self._stopped, self._first = self.model.num_timesteps, None, False, True
@@ -321,6 +333,9 @@ class RunCheckpointCallback(BaseCallback):
             lock.acquire(blocking=False)
         except Timeout:
             raise ValueError(f"folder: another training writes its checkpoints to {self.folder}") from None
+        except OSError as error:  # some file systems have no locks
+            warnings.warn(f"{self.folder} cannot be held: {error}. See to it that no other training writes there")
+            return
         self.model.until_learn_ends.callback(lock.release)  # type: ignore[attr-defined]
 
     def _note_signal(self, number: int, frame: Any) -> None:
@@ -354,10 +369,7 @@ class RunCheckpointCallback(BaseCallback):
             self.save()
 
     def _path(self) -> Path:
-        return self.folder / f"checkpoint_{self._lifetime_steps():012d}.safetensors"
-
-    def _lifetime_steps(self) -> int:
-        return getattr(self.model, "lifetime_steps", self.num_timesteps)
+        return self.folder / f"checkpoint_{self.model.lifetime_steps:012d}.safetensors"  # type: ignore[attr-defined]
 
     def save(self) -> bool:
         """
@@ -371,10 +383,10 @@ class RunCheckpointCallback(BaseCallback):
         except Exception as error:  # a full disk, or what environments or callbacks have come to hold: not worth the run
             self._warn_of(error)
             return False
-        # What is further can only be damaged, or ``learn`` would not have begun
         others = [each for each in checkpoint_files(self.folder) if each != path and _n_steps(each) >= 0]
-        further = [each for each in others if _n_steps(each) > _n_steps(path)]
-        for old in [*further, *others[len(further) :][self.keep - 1 :]]:
+        damaged = [each for each in self._damaged if each in others]
+        sound = [each for each in others if each not in damaged]
+        for old in [*damaged, *sound[self.keep - 1 :]]:
             try:
                 old.unlink(missing_ok=True)
             except OSError as error:

@@ -151,7 +151,7 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
     actor: DiffusionActor
     replay_buffer: ModeReplayBuffer
     _first_group = ("exploratory critics", "exploration_v_max", "intrinsic_coef")
-    _counters: ClassVar[dict[str, Any]] = {"n_rollouts": Count, "_next_mode_number": Count, "_steps_before": Count}
+    _counters: ClassVar[dict[str, Any]] = {"n_rollouts": Count, "_next_mode_number": Count}
 
     def __init__(
         self,
@@ -310,7 +310,6 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
         self._modes: list[Mode] = []
         self._next_mode_number = 0
         self.mode_history = ModeHistory()
-        self._steps_before = 0  # of earlier calls of ``learn`` that counted from 0
         self._behavior = Behavior(0)
 
         if _init_setup_model:
@@ -567,13 +566,6 @@ class DDiffPG(ModeControl, NoveltyActorCritic):
             self._behavior.begin(env, len(self._modes), *self._shares())
 
     # ------------------------------------------------------------------ a run's beginning
-
-    def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        steps = self.num_timesteps
-        prepared = super()._setup_learn(total_timesteps, *args, **kwargs)
-        if self.num_timesteps < steps:  # counted anew
-            self._steps_before += steps
-        return prepared
 
     def _begin_episodes(self) -> None:
         self._behavior.begin_all(self.n_envs, len(self._modes), *self._shares())

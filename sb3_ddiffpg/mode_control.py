@@ -28,7 +28,7 @@ class ModeControl:
     replay_buffer: ModeReplayBuffer
     logger: Logger
     num_timesteps: int
-    _steps_before: int
+    lifetime_steps: int
     mode_history: ModeHistory
     visits: VisitMap | None
     min_mode_size: int
@@ -51,11 +51,6 @@ class ModeControl:
         for mode, embedding in zip(self._modes, embeddings, strict=True):
             mode.embedding = embedding
         return ModeTable(self._modes)
-
-    @property
-    def lifetime_steps(self) -> int:
-        """Environment steps since the beginning; ``num_timesteps`` starts anew in a ``learn`` that is not told otherwise."""
-        return self._steps_before + self.num_timesteps
 
     # ------------------------------------------------------------------ finding
 

@@ -31,6 +31,8 @@ MOST = {
     **dict.fromkeys(("n_steps", "mode_n_steps", "exploration_n_steps", "gradient_steps"), 100_000),
     "batch_size": 2**24,
 }
+# Of optimisers: how a step is computed, whatever it was elsewhere
+_OF_THE_MACHINE = ("fused", "foreach", "capturable")
 # Of what optimisers gather
 _NOT_NEGATIVE = ("step", "exp_avg_sq", "max_exp_avg_sq")
 # Of the constructor, but not the model's: given again when it is loaded
@@ -142,7 +144,7 @@ def build_model(
     if policy is None:
         raise ValueError("the policy is a class of one's own, which no file holds: give custom_objects={'policy': ...}")
     arguments = {**_arguments(saved.arguments, {**given, **changes}), **given, **changes}
-    _check_arguments(arguments, saved.parameters)
+    _check_arguments({name: each for name, each in arguments.items() if name not in {**given, **changes}}, saved.parameters)
     if not 1 <= saved.n_envs <= MOST_ENVS:
         raise ValueError(f"model.n_envs: {saved.n_envs} given; accepted is 1 to {MOST_ENVS}")
     observation_space, action_space = _space(saved.observation_space), _space(saved.action_space)
@@ -158,7 +160,8 @@ def build_model(
         model.observation_space, model.action_space = observation_space, action_space
         model.n_envs = saved.n_envs if env is None else env.num_envs
         model.load_state_tree(saved.state)
-        model._in_file = saved.parameters
+        # Code of one's own may need values where it is made, and is trusted
+        model._in_file = None if given else saved.parameters
         model._setup_model()
         model._in_file = None
         if model.action_noise is not None:
@@ -199,9 +202,11 @@ def _check_arguments(arguments: dict[str, Any], parameters: dict[str, dict[str, 
             raise ValueError(f"model.arguments.{name}: {longest} layers for a file of {n_arrays} arrays")
 
 
-def _longest(value: Any) -> int:
-    parts = list(value.values()) if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else []
-    return max([0 if isinstance(value, dict) else len(parts), *map(_longest, parts)])
+def _longest(value: Any, name: str = "") -> int:
+    """Most layers of a network among arguments."""
+    if isinstance(value, dict):
+        return max([0, *(_longest(each, name if name == "net_arch" else key) for key, each in value.items())])
+    return len(value) if name == "net_arch" and isinstance(value, (list, tuple)) else 0
 
 
 def sized_as(expected: dict[str, Any], part: str, make: Callable[..., Built], *args: Any, **kwargs: Any) -> Built:
@@ -299,8 +304,8 @@ def _parameters(model: Any, trees: dict[str, dict[str, Any]]) -> dict[str, Tenso
 
 def _tensor(array: Any, like: th.Tensor, what: str) -> th.Tensor:
     array = check_array(convert(array, np.ndarray, what), _numpy_dtype(like), list(like.shape), what)
-    # A factor of zero has the logarithm -inf
-    if np.isnan(array).any() or (np.isinf(array).any() and not what.endswith("log_entropy_coef")):
+    # Infinite is what it is made so: the logarithm of a factor of zero, a mask
+    if np.isnan(array).any() or (np.isinf(array) & ~np.isinf(like.cpu().numpy())).any():
         raise ValueError(f"{what}: there are numbers that are not finite")
     return th.from_numpy(array.copy())
 
@@ -318,6 +323,7 @@ def _optimizer(optimizer: th.optim.Optimizer, own: dict[str, Any], tree: dict[st
     restored = []
     for group, before in zip(groups, own["param_groups"], strict=True):
         values = {key: from_plain(value) for key, value in convert(group, dict[str, Any], what).items()}
+        values |= {key: before[key] for key in _OF_THE_MACHINE if key in before}
         if set(values) != set(before) or values["params"] != before["params"]:
             raise ValueError(f"{what}: its settings are not those of a {type(optimizer).__name__}")
         for key, value in values.items():

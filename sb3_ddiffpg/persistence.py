@@ -37,6 +37,7 @@ class SavableAlgorithm(OffPolicyAlgorithm):
     _interrupted: InterruptedRun | None = None
     _learn_began_at = 0  # in environment steps; SB3's ``_num_timesteps_at_start`` moves when a run is resumed
     run_id: str
+    _steps_before = 0  # of earlier calls of ``learn`` that counted from 0
     #: Networks of the policy that follow others slowly and only train: what they follow, by name
     target_networks: ClassVar[dict[str, str]] = {}
     _saves_to_act = False
@@ -50,6 +51,7 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         "_total_timesteps": Count,
         "_num_timesteps_at_start": Count,
         "_learn_began_at": Count,
+        "_steps_before": Count,
         "run_id": str,
         "_episode_num": Count,
         "_n_updates": Count,
@@ -59,6 +61,11 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         "_warned_support": bool,
         "_warned_cut_values": bool,
     }
+
+    @property
+    def lifetime_steps(self) -> int:
+        """Environment steps of all training so far, also where ``learn`` has counted anew."""
+        return self._steps_before + self.num_timesteps
 
     def learn(
         self: SelfSavable,
@@ -78,7 +85,9 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         else:
             self._learn_began_at = 0 if reset_num_timesteps else self.num_timesteps
         with handlers_restored(), contextlib.ExitStack() as self.until_learn_ends:
-            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+            super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        self._interrupted = None  # there may have been no step left to do
+        return self
 
     def save(
         self,
@@ -258,10 +267,10 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         """
         counters = convert(tree.get("counters"), dict[str, Any], "model.state.counters")
         known = self._all_counters()
-        if set(counters) != set(known):
+        if not set(counters) <= set(known):
             raise ValueError(f"model.state.counters: {sorted(counters)} given; accepted are {sorted(known)}")
-        for name, kind in known.items():
-            setattr(self, name, convert(counters[name], kind, f"model.state.counters.{name}"))
+        for name, value in counters.items():  # what an older file does not have begins anew
+            setattr(self, name, convert(value, known[name], f"model.state.counters.{name}"))
         with contextlib.suppress(NeededError):  # then the constructor's argument says it
             self._resolved_features = from_plain(tree.get("mode_features"))
         self._novelty_cell_size = convert(tree.get("novelty_cell_size"), float | None, "model.state.novelty_cell_size")

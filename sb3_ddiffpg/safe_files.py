@@ -32,6 +32,10 @@ _LONGEST = 2**24
 _DEEPEST = 50
 
 
+class DamagedError(ValueError):
+    """A file is not what was written, or no file of this format."""
+
+
 def write(path: Path, kind: str, tree: Any) -> None:
     """
     Write a file so that at any moment the old one or the whole new one is there.
@@ -73,7 +77,9 @@ def read(path: Path, kind: str) -> Any:
     :param kind: What it must be
     :return: What was written, arrays in place of tensors
     :raises FileNotFoundError: If there is none
-    :raises ValueError: If it is something else, of a later version, or damaged
+    :raises OSError: If it cannot be read
+    :raises DamagedError: If it is damaged, or no file of this format
+    :raises ValueError: If it is of another kind or version
     """
     if not path.is_file():
         raise FileNotFoundError(errno.ENOENT, "There is no such file", str(path))
@@ -87,20 +93,20 @@ def read(path: Path, kind: str) -> Any:
             if metadata.get("kind") != kind:
                 raise ValueError(f"{path} holds a {metadata.get('kind')!r}, not a {kind!r}")
             arrays = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, OSError, TypeError, KeyError, AttributeError, MemoryError) as error:  # NumPy has fewer types
-        raise ValueError(f"{path} is damaged, or no file of {FORMAT}: {error}") from None
+    except (SafetensorError, TypeError, KeyError, AttributeError) as error:  # NumPy has fewer types
+        raise DamagedError(f"{path} is damaged, or no file of {FORMAT}: {error}") from None
     text = metadata.get("tree", "")
     if len(text) > _LONGEST:
         raise ValueError(f"{path}: {len(text)} characters of plain values; accepted are up to {_LONGEST}")
     if metadata.get("sha256") != _digest(kind, text, arrays):
-        raise ValueError(f"{path} is damaged: its contents do not fit their checksum")
+        raise DamagedError(f"{path} is damaged: its contents do not fit their checksum")
     try:
         tree = _unpack(json.loads(text), arrays, "")
         if arrays:
             raise ValueError(f"{sorted(arrays)[:3]} have no place in it")
         return tree
     except (ValueError, RecursionError, KeyError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from None
+        raise DamagedError(f"{path} is damaged: {error}") from None
 
 
 def remove_unfinished(folder: Path, names: str) -> None:

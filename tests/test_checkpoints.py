@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.checkpoints import KIND, RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.envs.snapshots import env_snapshot, restore_env
+from sb3_ddiffpg.envs.snapshots import env_snapshot, restore_env, restore_vec_env, vec_env_snapshot
 from sb3_ddiffpg.rng import global_rng, restore_global_rng
 from sb3_ddiffpg.safe_files import read, write
 
@@ -646,3 +647,70 @@ def test_runs_that_contradict_themselves_are_refused(tmp_path):
         write(tmp_path / "changed.safetensors", KIND, tree)
         with pytest.raises(ValueError, match=said):
             DDiffPG.resume(tmp_path / "changed.safetensors", known_ends())
+
+
+def test_a_finished_run_that_is_resumed_can_be_trained_further(tmp_path):
+    model_for(known_ends()).learn(200, callback=RunCheckpointCallback(tmp_path))
+    resumed = silent(DDiffPG.resume(tmp_path, known_ends()))
+    began = resumed.num_timesteps
+    assert resumed.learn(200).num_timesteps == began  # nothing is left of it
+    further = resumed.learn(100, reset_num_timesteps=False).num_timesteps
+    assert further >= began + 100
+    anew = resumed.learn(60).num_timesteps
+    assert 60 <= anew < began and resumed.lifetime_steps == further + anew
+
+
+@pytest.mark.parametrize("name", sorted(BASELINES))
+def test_a_second_call_writes_to_the_same_folder(tmp_path, name):
+    """Also where it counts anew."""
+    model = model_for(known_ends(), BASELINES[name], learning_starts=40, batch_size=16)
+    model.learn(100, callback=RunCheckpointCallback(tmp_path))
+    model.learn(60, callback=RunCheckpointCallback(tmp_path))
+    assert [int(path.stem[-12:]) for path in checkpoint_files(tmp_path)] == [160, 100]
+    assert BASELINES[name].resume(tmp_path, known_ends()).lifetime_steps == 160
+
+
+def test_test_environments_of_this_package_go_on(tmp_path):
+    """A new one waits with its seeds for the first reset, which the one that was saved has had."""
+    for make in (partial(make_vec_env, "PointMazeV1-v0", 2, seed=1, start_noise=0.5), partial(known_ends, 2)):
+        whole, other = make(), make()
+        for _ in range(2):
+            whole.reset()
+        restore_vec_env(other, copied(vec_env_snapshot(whole)))
+        np.testing.assert_array_equal(whole.reset(), other.reset())
+
+
+def test_tests_in_other_environments_do_not_end_a_run(tmp_path):
+    class Shy(KnownEnds):
+        def state_dict(self):
+            return {**super().state_dict(), "place": self.place}
+
+        def reset(self, **kwargs):
+            self.place = 1
+            return super().reset(**kwargs)
+
+    def callbacks(tests):
+        return [EvalCallback(tests, n_eval_episodes=1, eval_freq=20, verbose=0), RunCheckpointCallback(tmp_path, save_freq=50)]
+
+    model_for(known_ends()).learn(200, callback=callbacks(DummyVecEnv([Shy])))  # asked before it was ever reset
+    resumed = silent(DDiffPG.resume(tmp_path, known_ends()))
+    with pytest.warns(UserWarning, match="EvalCallback tests in other environments than before"):
+        resumed.learn(260, callback=callbacks(known_ends(2)))
+    assert resumed.num_timesteps >= 260
+
+
+def test_checkpoints_of_another_version_stay(tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_ddiffpg.safe_files.VERSION", 2)
+    model_for(known_ends()).learn(200, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+    before = checkpoint_files(tmp_path)
+    monkeypatch.setattr("sb3_ddiffpg.safe_files.VERSION", 1)
+    with pytest.raises(ValueError, match="of version '2'"):
+        model_for(known_ends()).learn(50, callback=RunCheckpointCallback(tmp_path))
+    assert checkpoint_files(tmp_path) == before
+
+
+def test_a_folder_that_cannot_be_held_is_used_with_a_warning(tmp_path, monkeypatch):
+    monkeypatch.setattr(FileLock, "acquire", lambda *_, **__: (_ for _ in ()).throw(OSError(37, "No locks available")))
+    with pytest.warns(UserWarning, match="cannot be held: .*No locks available"):
+        model_for(known_ends()).learn(50, callback=RunCheckpointCallback(tmp_path))
+    assert checkpoint_files(tmp_path)

@@ -186,6 +186,15 @@ def test_a_record_that_lacks_something_is_named(tmp_path, missing):
         store.read_results(tmp_path)
 
 
+@pytest.mark.parametrize(("steps", "said"), [(1600, "1600"), (150_016, "150 k"), (4_000_000, "4,000 k")])
+def test_steps_are_told_in_thousands(tmp_path, steps, said):
+    folder = training(tmp_path, "a", 0, 20)
+    record = yaml.safe_load((folder / "config.yml").read_text())
+    record["result"]["steps"] = steps
+    (folder / "config.yml").write_text(yaml.safe_dump(record))
+    assert summary.task_table(store.read_results(tmp_path)[0]).loc[0, "steps"] == said
+
+
 def test_few_seeds_have_a_range():
     """A percentile bootstrap of three would hold the truth in 72 of 100 cases, and say 95."""
     assert summary.interquartile_mean([0.2, 0.9, 0.4]) == (pytest.approx(0.5), 0.2, 0.9)

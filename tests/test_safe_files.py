@@ -11,6 +11,7 @@ import zipfile
 
 import numpy as np
 import pytest
+import torch as th
 from environments import (
     AnySpaces,
     TwoEnds,
@@ -27,6 +28,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from safetensors.numpy import load_file, save_file
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
@@ -355,6 +357,36 @@ def test_records_that_no_training_makes_are_refused(trained):
         _set(tree, place, value)
         with pytest.raises(ValueError, match=said):
             build_model(DDiffPG, tree)
+
+
+class ReadsValues(BaseFeaturesExtractor):
+    """Somebody's own, whose constructor looks at values, and which has a mask of infinities."""
+
+    def __init__(self, observation_space, mean=()):
+        super().__init__(observation_space, 2)
+        assert float(th.from_numpy(observation_space.sample()).abs().sum()) >= 0 and th.ones(2).sum().item() == 2
+        self.register_buffer("mask", th.full((2,), -float("inf")))
+
+    def forward(self, observations):
+        return observations
+
+
+def test_networks_of_ones_own_are_made_as_they_are(trained, tmp_path):
+    kwargs = {"net_arch": [16], "features_extractor_class": ReadsValues, "features_extractor_kwargs": {"mean": [0.0] * 500}}
+    model = small_model(DummyVecEnv([TwoEnds]), policy_kwargs=kwargs)
+    model.export(tmp_path / "model")
+    loaded = DDiffPG.load(tmp_path / "model", safe=True, custom_objects={"policy_kwargs": kwargs})
+    obs = some_observations()
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+
+
+def test_what_older_files_do_not_have_begins_anew(trained):
+    tree = copied(model_tree(trained))
+    del tree["state"]["counters"]["n_rollouts"]
+    for group in tree["parameters"]["actor.optimizer"]["groups"]:
+        group["fused"] = None  # of another machine
+    model = build_model(DDiffPG, tree)
+    assert model.n_rollouts == 0 and model.actor.optimizer.param_groups[0]["fused"] is True
 
 
 def test_names_of_other_classes_are_refused(trained, tmp_path):

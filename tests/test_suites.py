@@ -108,6 +108,7 @@ def test_every_suite_of_the_package_can_be_run(name):
         (("variants:", "variants: ["), "is no YAML"),
         (("seeds: [0]", "seeds: [0]\nseeds: [1]"), "'seeds' stands twice"),
         (("td3_c51, wide", "ddiffpg"), "'ddiffpg' stands twice"),
+        (("seeds: [0]", "seeds: [0]\n? [1, 2]\n: 3"), "is no YAML"),
         (("td3_c51, wide", "wide "), "variant"),
         (("{algo: td3_c51", "{algorithm: td3_c51"), "accepted are algo, conf_file, settings, members"),
         (("seeds: [0]", "resources: {gpus: .nan}\nseeds: [0]"), "gpus"),

@@ -15,7 +15,7 @@ from environments import AnySpaces, TwoEnds, image_dict_space, small_model
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.envs.workers import WorkerVecEnv
+from sb3_ddiffpg.envs.workers import WorkerVecEnv, _end
 
 
 class Fragile(TwoEnds):
@@ -267,12 +267,32 @@ def test_in_one_process_too_it_is_said_where(monkeypatch):
         del gym.registry["Fragile-v0"]
 
 
+def test_an_interrupted_close_leaves_nobody_behind():
+    class Sleeper:
+        alive = True
+
+        def join(self, timeout=None):
+            if timeout is not None:
+                raise KeyboardInterrupt
+
+        def is_alive(self):
+            return self.alive
+
+        def kill(self):
+            self.alive = False
+
+    sleepers = [Sleeper(), Sleeper()]
+    with pytest.raises(KeyboardInterrupt):
+        _end([], sleepers)
+    assert not any(each.alive for each in sleepers)
+
+
 SCRIPT = """
 import sys
 from environments import TwoEnds, small_model
 from stable_baselines3.common.callbacks import BaseCallback
 from sb3_ddiffpg.checkpoints import RunCheckpointCallback
-from sb3_ddiffpg.envs.workers import WorkerVecEnv
+from sb3_ddiffpg.envs.workers import WorkerVecEnv, _end
 
 class Tells(BaseCallback):
     def _on_step(self):

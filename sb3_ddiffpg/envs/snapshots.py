@@ -142,13 +142,13 @@ def restore_vec_env(env: VecEnv, tree: Any) -> None:
             raise ValueError(f"environments: {len(states)} saved, there are {core.num_envs}")
         for each, state in zip(core.envs, states, strict=True):
             restore_env(each, state)
-        # What a new one is made with waits for its first reset, which this one has had
-        core._reset_seeds()
-        core._reset_options()
     elif hasattr(core, "load_state_dict"):
         core.load_state_dict(snapshot.core)
     else:
         raise ValueError(f"environments: saved of another kind than {type(core).__name__}")
+    # What a new one is made with waits for its first reset, which this one has had
+    core._reset_seeds()
+    core._reset_options()
 
 
 def _peel(env: Any, wrapper: type, inner: str, known: dict[type, dict[str, Any]]) -> tuple[list[dict[str, Any]], Any] | None:

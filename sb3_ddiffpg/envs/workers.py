@@ -94,16 +94,19 @@ def _answer(envs: Any, command: str, argument: Any) -> Any:
 
 
 def _end(remotes: Sequence[Connection], processes: Sequence[Any]) -> None:
-    for remote in remotes:
-        with contextlib.suppress(OSError):  # gone already
-            remote.send(("close", None))
-    for process in processes:
-        process.join(timeout=5)
-        if process.is_alive():
-            process.kill()
-            process.join()
-    for remote in remotes:
-        remote.close()
+    try:
+        for remote in remotes:
+            with contextlib.suppress(OSError):  # gone already
+                remote.send(("close", None))
+        for process in processes:
+            process.join(timeout=5)
+    finally:  # also when it is interrupted: they do not listen to signals
+        for process in processes:
+            if process.is_alive():
+                process.kill()
+                process.join()
+        for remote in remotes:
+            remote.close()
 
 
 class WorkerVecEnv(VecEnv):

@@ -40,6 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         work()
     except (ValueError, ImportError, OSError) as error:
         if known.command == "trial":  # where it may come from the depths of somebody's environment
+            if isinstance(error, OSError):
+                raise  # another attempt may do better
             traceback.print_exc()
         own.exit(REFUSED, f"{own.prog}: error: {error}\n")
 

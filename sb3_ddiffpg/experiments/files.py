@@ -17,7 +17,9 @@ class _StrictLoader(yaml.SafeLoader):
             if key_node.tag == "tag:yaml.org,2002:merge":
                 continue
             key = self.construct_object(key_node, deep=True)
-            if isinstance(key, Hashable) and key in known:
+            if not isinstance(key, Hashable):
+                continue  # which PyYAML refuses
+            if key in known:
                 raise yaml.constructor.ConstructorError(None, None, f"{key!r} stands twice", key_node.start_mark)
             known.add(key)
         return super().construct_mapping(node, deep)

@@ -183,11 +183,13 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
 
 def _run(given: argparse.Namespace, suite: Suite, folder: Path, missing: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / ".lock")
     try:
-        with FileLock(folder / ".lock", blocking=False):
-            _run_alone(given, suite, folder, missing)
+        lock.acquire(blocking=False)
     except Timeout:
         raise ValueError(f"--out: {folder} given, where another run is at work; accepted is another folder") from None
+    with lock:
+        _run_alone(given, suite, folder, missing)
 
 
 def _run_alone(given: argparse.Namespace, suite: Suite, folder: Path, missing: bool) -> None:

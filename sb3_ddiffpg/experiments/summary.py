@@ -80,7 +80,8 @@ def task_table(runs: Sequence[Recorded]) -> pd.DataFrame:
         row["success, last model"] = _cell([run.last_success for run in own], 2)
         short = max(run.result["hours"] for run in runs) < 1
         row["minutes" if short else "hours"] = _cell([run.result["hours"] * (60 if short else 1) for run in own], 1)
-        row["steps"] = f"{np.mean([run.result['steps'] for run in own]) / 1000:.3g} k"
+        steps = np.mean([run.result["steps"] for run in own])
+        row["steps"] = f"{steps / 1000:,.0f} k" if steps >= 10_000 else f"{steps:.0f}"
         times = [1000 * time for run in own if (time := seconds_per_update(run)) is not None]
         row["learning, s per 1000 updates"] = _cell(times, 1)
         rows.append(row | _paper_cells(task_of(own[0]), own[0]))

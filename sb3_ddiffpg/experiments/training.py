@@ -234,7 +234,10 @@ def _run_union(trial: Trial, folder: Path) -> None:
     record["result"] = {
         "complete": True,
         **{name: sum(result[name] for result in results) for name in ("steps", "updates", "hours", "cpu_hours")},
-        "seconds": {part: round(sum(result["seconds"][part] for result in results), 1) for part in results[0]["seconds"]},
+        "seconds": {
+            part: round(sum(result["seconds"][part] for result in results), 1)
+            for part in set.intersection(*(set(result["seconds"]) for result in results))
+        },
     }
     write_record(record, folder)
     write_progress(folder / "logs", Progress(record["result"]["steps"], record["result"]["steps"], "done"))

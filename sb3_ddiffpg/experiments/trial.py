@@ -132,6 +132,8 @@ def _alike(one: gym.Space, other: gym.Space) -> bool:
     """Bounds may differ: of another maze they do."""
     if isinstance(one, gym.spaces.Box) and isinstance(other, gym.spaces.Box):
         return (one.shape, one.dtype) == (other.shape, other.dtype)
+    if isinstance(one, gym.spaces.Dict) and isinstance(other, gym.spaces.Dict):
+        return one.keys() == other.keys() and all(_alike(one[key], other[key]) for key in one)
     return one == other
 
 
