@@ -296,6 +296,13 @@ def test_a_card_and_its_upload(trained, capsys):
             calls.append(kwargs)
             return "https://there"
 
+    class Offline(Api):
+        def create_repo(self, repo_id, exist_ok):
+            raise RuntimeError("no network")
+
+    with pytest.raises(OSError, match=r"README.md is written, but not uploaded to me/it: RuntimeError\('no network'\)"):
+        card.upload(trained, "me/it", api=Offline())
+
     assert card.upload(trained, "me/it", Api()) == "https://there"
     assert calls[0] == ("me/it", True) and calls[1]["folder_path"] == trained and "logs" not in str(calls[1]["allow_patterns"])
     for arguments in ([str(trained), "--repo-id", "it"], [str(trained / "logs"), "--repo-id", "me/it"]):

@@ -82,13 +82,17 @@ def upload(folder: Path, repo_id: str, api: Any = None) -> str:
     :param repo_id: Where to, ``OWNER/NAME``; made if there is none
     :param api: An ``HfApi``; with the user's own token when None
     :return: Address of what was uploaded
+    :raises OSError: If that cannot be; the card is there
     """
-    write_card(folder, repo_id)
+    card = write_card(folder, repo_id)
     api = api or HfApi()
-    api.create_repo(repo_id, exist_ok=True)
     files = ["README.md", SAFE_MODEL, "model.zip", "evaluation*.json", "curve.csv", "config.yml", "vecnormalize.pkl"]
-    done = api.upload_folder(repo_id=repo_id, folder_path=folder, allow_patterns=files, commit_message="A recorded training")
-    return str(done)
+    what: dict[str, Any] = dict(folder_path=folder, allow_patterns=files, commit_message="A recorded training")
+    try:
+        api.create_repo(repo_id, exist_ok=True)
+        return str(api.upload_folder(repo_id=repo_id, **what))
+    except Exception as error:  # of the network, the token or the hub, and of any of its libraries
+        raise OSError(f"{card} is written, but not uploaded to {repo_id}: {error!r}") from error
 
 
 def _package(model: Any) -> str:
