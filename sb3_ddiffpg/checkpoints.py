@@ -181,10 +181,9 @@ class InterruptedRun:
 
     def _noise(self, model: Any) -> ActionNoise | None:
         try:
-            noise = from_plain(copy.deepcopy(self.run.noise))  # it changes its arrays
+            return from_plain(copy.deepcopy(self.run.noise))  # it changes its arrays
         except NeededError:  # one's own kind: custom_objects had it
             return model.action_noise
-        return noise
 
 
 def _observations(value: Any, model: Any, what: str) -> Any:

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 
+from sb3_ddiffpg.rng import preserved_rng
+
 
 class SpreadNormalActionNoise(VectorizedActionNoise):
     """
@@ -57,14 +59,12 @@ def check_noise(noise: Any, n_envs: int, size: int) -> None:
         raise ValueError(f"noise: {str(noise)[:100]!r} is none")
     if isinstance(noise, SpreadNormalActionNoise) and getattr(noise, "shape", None) != (n_envs, size):
         raise ValueError(f"noise: of another shape than {n_envs} actions of size {size}")
-    before = np.random.get_state()
     try:
-        tried = copy.deepcopy(noise)
-        tried.reset()
-        drawn = np.asarray(tried(), dtype=np.float64)
+        with preserved_rng():
+            tried = copy.deepcopy(noise)
+            tried.reset()
+            drawn = np.asarray(tried(), dtype=np.float64)
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError) as error:
         raise ValueError(f"noise: it draws nothing: {error!r}") from None
-    finally:
-        np.random.set_state(before)
     if drawn.size not in (size, size * n_envs) or not np.isfinite(drawn).all():
         raise ValueError(f"noise: what it draws is no noise for {n_envs} actions")

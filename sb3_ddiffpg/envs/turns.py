@@ -1,6 +1,7 @@
 """Environments that are stepped one after the other, and whose turn it was when one of them raised."""
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -45,18 +46,20 @@ class TurnVecEnv(DummyVecEnv):
         """
         :return: observations of new episodes
         """
-        try:
+        with self._said_where():
             return super().reset()
-        except Exception as error:
-            error.add_note(f"Raised by environment {self._turn.value}")
-            raise
 
     def step_wait(self) -> VecEnvStepReturn:
         """
         :return: observations, rewards, dones and infos
         """
-        try:
+        with self._said_where():
             return super().step_wait()
+
+    @contextmanager
+    def _said_where(self) -> Iterator[None]:
+        try:
+            yield
         except Exception as error:
             error.add_note(f"Raised by environment {self._turn.value}")
             raise

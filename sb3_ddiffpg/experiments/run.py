@@ -173,9 +173,10 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
     missing = missing_trials(suite, folder)
     print(f"{suite.description}\n{len(missing)} of {suite.n_trials} trials to run", flush=True)
     commits = Counter(read_record(folder / place).get("git_commit") for place in suite.trials().keys() - missing.keys())
-    others = ", ".join(f"{n} of commit {commit}" for commit, n in commits.items() if commit != git_commit())
+    here = git_commit()
+    others = ", ".join(f"{n} of commit {commit}" for commit, n in commits.items() if commit != here)
     if others:
-        print(f"What is complete already is not of this commit ({git_commit()}): {others}", flush=True)
+        print(f"What is complete already is not of this commit ({here}): {others}", flush=True)
     if given.list:
         return partial(print, *missing, sep="\n", end="\n" if missing else "")
     return partial(_run, given, suite, folder, bool(missing))

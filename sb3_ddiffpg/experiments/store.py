@@ -109,21 +109,22 @@ def _check(record: dict[str, Any]) -> None:
 
 
 def _of_files(folder: Path, record: dict[str, Any], curve: Path, elsewhere: list[Path]) -> Recorded:
+    best = ModeEvaluation.load(folder / "evaluation.json")
     return Recorded(
         folder,
         trial_of(record, folder),
         record,
         pd.read_csv(curve) if curve.is_file() else pd.DataFrame(),
-        ModeEvaluation.load(folder / "evaluation.json"),
+        best,
         {path.stem.removeprefix("evaluation_"): ModeEvaluation.load(path) for path in elsewhere},
-        _last_success(folder, record),
+        _last_success(folder, record["result"], best),
     )
 
 
-def _last_success(folder: Path, record: dict[str, Any]) -> float:
-    last = folder / "logs" / "evaluation_final.json"
-    is_best = record["result"].get("best_step") == record["result"]["steps"]
-    path = folder / "evaluation.json" if is_best else last
+def _last_success(folder: Path, result: dict[str, Any], best: ModeEvaluation) -> float:
+    if result.get("best_step") == result["steps"]:
+        return best.uncommanded.success_rate
+    path = folder / "logs" / "evaluation_final.json"
     return ModeEvaluation.load(path).uncommanded.success_rate if path.is_file() else float("nan")
 
 
