@@ -160,8 +160,8 @@ def build_model(
         model.observation_space, model.action_space = observation_space, action_space
         model.n_envs = saved.n_envs if env is None else env.num_envs
         model.load_state_tree(saved.state)
-        # Code of one's own may need values where it is made, and is trusted
-        model._in_file = None if given else saved.parameters
+        # Networks of one's own may need values where they are made, and are trusted
+        model._in_file = None if {"policy_kwargs", "novelty"} & given.keys() else saved.parameters
         model._setup_model()
         model._in_file = None
         if model.action_noise is not None:

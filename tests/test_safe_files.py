@@ -380,6 +380,13 @@ def test_networks_of_ones_own_are_made_as_they_are(trained, tmp_path):
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
 
 
+def test_a_schedule_of_ones_own_does_not_let_a_small_file_ask_for_all_of_the_memory(trained):
+    tree = read_back(trained)
+    tree["arguments"]["policy_kwargs"] = {"dict": {"net_arch": [10**6, 10**6]}}
+    with pytest.raises(ValueError, match="accepted is"):
+        build_model(DDiffPG, tree, custom_objects={"learning_rate": lambda _: 1e-3})
+
+
 def test_what_older_files_do_not_have_begins_anew(trained):
     tree = copied(model_tree(trained))
     del tree["state"]["counters"]["n_rollouts"]
