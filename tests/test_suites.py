@@ -164,6 +164,21 @@ def test_a_suite_runs_once(tiny, tmp_path, capsys):
     assert "holds another training" in capsys.readouterr().err
 
 
+def test_a_run_that_ended_holds_its_folder_no_longer(tiny, tmp_path, monkeypatch):
+    """Whoever keeps its error keeps all that it had in hand."""
+    command = ["run", str(tiny), "--out", str(tmp_path / "out"), "--no-report"]
+
+    def fail(*_):
+        raise RuntimeError("no more")
+
+    monkeypatch.setattr("sb3_ddiffpg.experiments.run.run_suite", fail)
+    kept = []
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="no more") as failed:
+            cli.main(command)
+        kept.append(failed.value)
+
+
 def _wait_for(condition, seconds=120):
     deadline = time.monotonic() + seconds
     while not condition():

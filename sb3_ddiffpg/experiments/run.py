@@ -184,12 +184,11 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
 
 def _run(given: argparse.Namespace, suite: Suite, folder: Path, missing: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / ".lock")
     try:
-        lock.acquire(blocking=False)
+        held = FileLock(folder / ".lock").acquire(blocking=False)
     except Timeout:
         raise ValueError(f"--out: {folder} given, where another run is at work; accepted is another folder") from None
-    with lock:
+    with held:
         _run_alone(given, suite, folder, missing)
 
 
