@@ -3,7 +3,7 @@ PYTHON := $(shell python3.11 -c "print('python3.11')" 2>/dev/null || echo python
 BIN := .venv/bin
 DEPENDENCIES := setup.cfg pyproject.toml constraints.txt
 
-.PHONY: demo test fast slow gpu fuzz soak lint type format bench clean
+.PHONY: demo test fast slow gpu fuzz oldest soak lint type format bench clean
 
 demo: .venv/.installed
 	$(BIN)/python examples/demo.py
@@ -28,6 +28,13 @@ fuzz: .venv/.installed-dev
 	for test in $$($(BIN)/python tests/fuzz.py 2>&1 >/dev/null | tail -n +2); do \
 		OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz.py $$test -max_total_time=$(SECONDS) || exit 1; done
 
+# the fast tests with the lowest versions that setup.cfg accepts
+oldest:
+	$(PYTHON) -m venv .venv-oldest
+	.venv-oldest/bin/pip install --quiet uv
+	.venv-oldest/bin/uv pip install --python .venv-oldest/bin/python --quiet --resolution lowest-direct -e ".[all,dev]"
+	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest -n 2
+
 # half an hour
 soak: .venv/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/soak.py
@@ -47,7 +54,7 @@ bench: .venv/.installed-dev
 	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
 
 clean:
-	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-oldest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
 
 .venv/.installed: $(DEPENDENCIES) | .venv
 	$(BIN)/pip install --quiet -c constraints.txt -e ".[zoo,plots]"

@@ -1,4 +1,4 @@
-"""Files that a user names: YAML read strictly, and folders that can be written."""
+"""Files and folders of experiments: YAML read strictly, a folder for each task, and folders that can be written."""
 
 import os
 from collections.abc import Hashable
@@ -45,6 +45,14 @@ def read_yaml(name: str, path: Path) -> Any:
         return parse_yaml(path.read_text())
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{name}: {path} is no YAML: {error}") from None
+
+
+def task_file_name(task: str) -> str:
+    """
+    :param task: Name of an environment, with its namespace if it has one
+    :return: Name of it for files and folders
+    """
+    return task.replace("/", "-")
 
 
 def check_output(folder: Path) -> None:

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sb3_ddiffpg.experiments import figures
-from sb3_ddiffpg.experiments.files import check_output
+from sb3_ddiffpg.experiments.files import check_output, task_file_name
 from sb3_ddiffpg.experiments.record import command_line
 from sb3_ddiffpg.experiments.store import Recorded, by, check_alike, read_results, task_of, variant_of
 from sb3_ddiffpg.experiments.summary import elsewhere_table, seconds_per_update, task_table
@@ -46,7 +46,7 @@ def make_report(
     runs, incomplete = read_results(results)
     if suite is not None:
         runs = [run for run in runs if task_of(run) in suite[0] and variant_of(run) in suite[1]]
-        places = {(task.replace("/", "-"), variant) for task in suite[0] for variant in suite[1]}
+        places = {(task_file_name(task), variant) for task in suite[0] for variant in suite[1]}
         incomplete = [folder for folder in incomplete if folder.relative_to(results).parts[:2] in places]
     if not runs:
         raise ValueError(f"results: none of the {len(incomplete)} trainings in {results} is complete")

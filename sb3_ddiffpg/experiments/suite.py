@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from sb3_ddiffpg.experiments.files import read_yaml
+from sb3_ddiffpg.experiments.files import read_yaml, task_file_name
 from sb3_ddiffpg.experiments.trial import Tests, Trial, hyperparameters
 from sb3_ddiffpg.zoo import ALGO
 
@@ -88,7 +88,7 @@ class Suite(msgspec.Struct, forbid_unknown_fields=True):
                 for name in self.variants:
                     trial = self._trial(task, name, seed)
                     trial.check()
-                    found[Path(task.replace("/", "-"), name, f"seed{seed}")] = trial
+                    found[Path(task_file_name(task), name, f"seed{seed}")] = trial
         values = [trial.hyperparams.get(self.ablation) for trial in found.values()] if self.ablation is not None else []
         if not all(isinstance(value, (int, float)) for value in values):
             raise ValueError(f"ablation: {self.ablation!r} given; accepted is a setting that is a number in every variant")

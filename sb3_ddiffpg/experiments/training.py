@@ -25,7 +25,7 @@ from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.evaluation import evaluate_modes
 from sb3_ddiffpg.experiments.curve import CurveCallback
-from sb3_ddiffpg.experiments.files import check_output, parse_yaml
+from sb3_ddiffpg.experiments.files import check_output, parse_yaml, task_file_name
 from sb3_ddiffpg.experiments.progress import Progress, ProgressCallback, write_progress
 from sb3_ddiffpg.experiments.record import (
     check_folder,
@@ -189,7 +189,7 @@ class _Training:
             print(f"\n{name} model\n{found}")
         for env_id in self.trial.tests.also:
             found = self._evaluate_elsewhere(tested, env_id, seed, env_kwargs)
-            found.save(self.folder / f"evaluation_{env_id.replace('/', '-')}.json")
+            found.save(self.folder / f"evaluation_{task_file_name(env_id)}.json")
             print(f"\nin {env_id}\n{found}")
 
     def _evaluate_elsewhere(self, model: Any, env_id: str, seed: int, env_kwargs: dict[str, Any]) -> ModeEvaluation:
