@@ -129,8 +129,9 @@ class ModeControl:
         if any(name == other.name for other in self._modes if other is not record):
             raise ValueError(f"name={name!r} is another mode's; the modes are {ModeTable(self._modes).names}")
         check_name(name, record.number)
-        self._note("renamed to", record, name)
-        record.name = name
+        if name != record.name:
+            self._note("renamed to", record, name)
+            record.name = name
 
     def freeze_mode(self, mode: str | int | Mode, frozen: bool = True) -> None:
         """

@@ -44,6 +44,20 @@ def _new(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def panels(n: int) -> tuple[Figure, list[Any]]:
+    """
+    :param n: How many
+    :return: A figure of rows of up to four, and the axes of each
+    """
+    n_rows = -(-max(n, 1) // 4)
+    n_columns = -(-max(n, 1) // n_rows)
+    figure = _new(4.4 * n_columns, 3.6 * n_rows)
+    grid = figure.subplots(n_rows, n_columns, squeeze=False).ravel().tolist()
+    for axes in grid[n:]:
+        axes.axis("off")
+    return figure, grid[:n]
+
+
 def _count_steps(axes: Any) -> None:
     axes.set_xlabel("environment steps")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -268,23 +282,17 @@ def plot_values(model: Any, observations: np.ndarray, maze: Any = None, normaliz
     shown = parts if normalizer is None else [normalizer.normalize_obs(part) for part in parts]
     values = np.concatenate([model.mode_values(part) for part in shown])
     positions = _in_plane(model.replay_buffer.features(observations))
-    n_columns = min(3, len(modes))
-    n_rows = -(-len(modes) // n_columns)
-    figure = _new(4.2 * n_columns, 3.8 * n_rows)
-    grid = np.atleast_1d(figure.subplots(n_rows, n_columns, squeeze=False)).ravel()
-    low, high = float(values.min()), float(values.max())
+    figure, grid = panels(len(modes))
+    limits = float(values.min()), float(values.max())
     image: Any = None
-    for index, axes in enumerate(grid):
-        if index >= len(modes):
-            axes.axis("off")
-            continue
-        image = draw_values(axes, positions, values[:, index], maze, (low, high))
-        if len(modes[index].representative):
-            route = _in_plane(modes[index].representative)
+    for axes, mode, expected in zip(grid, modes, values.T, strict=True):
+        image = draw_values(axes, positions, expected, maze, limits)
+        if len(mode.representative):
+            route = _in_plane(mode.representative)
             axes.plot(*route.T, color="w", lw=2.5, zorder=2)
-            axes.plot(*route.T, color=mode_color(modes[index].number), lw=1.5, zorder=2)
-        axes.set_title(modes[index].name)
-    figure.colorbar(image, ax=grid.tolist(), label="value of the mode (discounted, scaled reward)")
+            axes.plot(*route.T, color=mode_color(mode.number), lw=1.5, zorder=2)
+        axes.set_title(mode.name)
+    figure.colorbar(image, ax=grid, label="value of the mode (discounted, scaled reward)")
     return figure
 
 

@@ -38,6 +38,7 @@ def test_a_name_is_kept_for_life(two_routes, tmp_path):
     assert set(loaded.modes.names) == {"over the hill", "tal-2", "mode_2"}
     loaded.set_logger(model.logger)
     loaded.rename_mode("over the hill", "hill")
+    loaded.rename_mode("hill", "hill")  # is nothing that happened
     loaded.load_replay_buffer(tmp_path / "buffer")
     walk(loaded, "down", 3)
     assert said(loaded) == [] and route_of(loaded.modes["hill"]) == "up"

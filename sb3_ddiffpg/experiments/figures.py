@@ -59,7 +59,7 @@ def curves(runs: Sequence[Recorded], measure: str, against: str = "step") -> Fig
             shown += [(f"{variant}\n{task}", data, means) for variant, data in table.groupby("variant", sort=False)]
         else:
             shown.append((task, table, []))
-    figure, panels = _panels(len(shown))
+    figure, panels = plots.panels(len(shown))
     for axes, (title, data, behind) in zip(panels, shown, strict=True):
         for line in behind:
             axes.plot(line.index, line, color="0.85", linewidth=0.8)
@@ -115,7 +115,7 @@ def ablation(runs: Sequence[Recorded], setting: str) -> Figure:
     :return: The figure
     """
     measures = ("success", "modes in 20")
-    figure, panels = _panels(len(measures))
+    figure, panels = plots.panels(len(measures))
     for axes, measure in zip(panels, measures, strict=True):
         rows = [(run.trial.hyperparams[setting], MEASURES[measure](run.evaluation), task_of(run)) for run in runs]
         data = pd.DataFrame(rows, columns=[setting, measure, "task"])
@@ -182,7 +182,7 @@ class Maps:
         visited = {variant: model.visits for variant, model in self.models.items() if getattr(model, "visits", None)}
         if self.maze is None or not visited:
             return None
-        figure, panels = _panels(len(visited))
+        figure, panels = plots.panels(len(visited))
         most = max(plots.usual_visits(visits) for visits in visited.values())
         for axes, (variant, visits) in zip(panels, visited.items(), strict=True):
             image = plots.draw_visits(axes, visits, self.maze, most)
@@ -203,7 +203,7 @@ class Maps:
         }
         if not shown:
             return None
-        figure, panels = _panels(len(shown))
+        figure, panels = plots.panels(len(shown))
         for axes, (variant, model) in zip(panels, shown.items(), strict=True):
             places = plots.grid_observations(model, self.observation[0], self.maze)
             image = plots.draw_values(axes, model.replay_buffer.features(places), model.state_values(places), self.maze)
@@ -216,16 +216,6 @@ def _final_model(run: Recorded) -> Any:
     """It has seen all of training; where it was not kept, the best one."""
     final = run.folder / "logs" / "final_model.zip"
     return final if final.is_file() else run.folder / "model.zip"
-
-
-def _panels(n: int) -> tuple[Figure, list[Any]]:
-    n_rows = -(-max(n, 1) // 4)
-    n_columns = -(-max(n, 1) // n_rows)
-    figure = Figure(figsize=(4.4 * n_columns, 3.6 * n_rows), layout="constrained")
-    grid = figure.subplots(n_rows, n_columns, squeeze=False).ravel().tolist()
-    for axes in grid[n:]:
-        axes.axis("off")
-    return figure, grid[:n]
 
 
 def _one_legend(figure: Figure, panels: Sequence[Any], colors: dict[str, Any]) -> None:
