@@ -107,11 +107,13 @@ def test_over_tasks_only_what_has_all(tmp_path):
 def test_curves_pass_through_the_tests(tmp_path):
     training(tmp_path, "a", 0, 20)
     training(tmp_path, "a", 1, 10)
+    (training(tmp_path, "without a curve", 0, 20) / "curve.csv").unlink()
     figure = figures.curves(store.read_results(tmp_path)[0], "success_rate")
     (line,) = [line for line in figure.axes[0].lines if len(line.get_xdata())]
     np.testing.assert_allclose(np.interp([0, 25, 50, 100], *line.get_data()), [0, 0.25, 0.5, 0.75], atol=0.01)
     (band,) = figure.axes[0].collections
     assert band.get_paths()[0].vertices[:, 1].max() == pytest.approx(1.0)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a"]
 
 
 def test_each_of_many_variants_has_a_panel(tmp_path):
