@@ -3,6 +3,7 @@
 import math
 import re
 from collections import defaultdict
+from copy import deepcopy
 from functools import partial
 from unittest.mock import patch
 
@@ -16,6 +17,7 @@ from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ddiffpg import DDiffPG
@@ -517,6 +519,22 @@ def test_td3_waits_with_its_policy():
     assert len(metrics["actor_loss"]) == 2
 
 
+def test_td3s_targets_wait_with_its_policy():
+    """As in the paper's algorithm, and SB3's."""
+    model = small(TD3C51, policy_delay=3, actor_tau=0.1, gradient_steps=1)
+    model.learn(40)
+    networks = {"actor": model.policy.actor_target, "critics": model.policy.critics_target}
+    moved = {name: [] for name in networks}
+    for _ in range(6):
+        before = {name: deepcopy(network.state_dict()) for name, network in networks.items()}
+        model.train(1, 32)
+        for name, network in networks.items():
+            moved[name].append(any(not th.equal(value, before[name][key]) for key, value in network.state_dict().items()))
+    assert moved["actor"] == moved["critics"] and sum(moved["actor"]) == 2
+    first = moved["actor"].index(True)
+    assert moved["actor"][first + 3]
+
+
 def test_sacs_entropy_is_part_of_the_target():
     model = small(SACC51, n_atoms=1, v_min=-100.0, v_max=100.0, initial_entropy_coef=0.7)
     model.learn(40)
@@ -544,22 +562,31 @@ def test_sacs_entropy_coefficient_follows_its_target():
 @pytest.mark.slow
 @pytest.mark.parametrize(("ours", "theirs"), [(TD3C51, TD3), (SACC51, SAC)])
 def test_pendulum_is_learnt_as_by_sb3(tmp_path, ours, theirs):
-    """Scalar critics, no bonus, SB3's own settings: the same curves within the noise of three seeds, and both swing it up."""
+    """Scalar critics, no bonus, SB3's own settings: the same curves within the noise of three seeds, and both learn."""
     settings = {"learning_starts": 500, "batch_size": 256, "tau": 0.005, "gamma": 0.98, "learning_rate": 1e-3}
+    settings["action_noise"] = NormalActionNoise(np.zeros(1), np.full(1, 0.1)) if ours is TD3C51 else None
     arch = {"net_arch": [64, 64]}
-    own = {"n_atoms": 1, "v_min": -2000.0, "v_max": 0.0, "intrinsic_coef": 0.0, "max_grad_norm": 1e6}
+    own_arch = {"activation_fn": th.nn.ReLU, "critic_activation_fn": th.nn.ReLU, "optimizer_class": th.optim.Adam}
+    own = {
+        "policy_kwargs": {**arch, **own_arch},
+        "n_atoms": 1,
+        "v_min": -2000.0,
+        "v_max": 0.0,
+        "intrinsic_coef": 0.0,
+        "max_grad_norm": 1e6,
+    }
     if ours is SACC51:  # entropy makes values positive; SB3 tunes its coefficient at the learning rate
         own |= {"v_max": 2000.0, "entropy_learning_rate": 1e-3}
     if ours is TD3C51:
         own |= {"policy_delay": 2, "actor_tau": 0.005, "target_policy_noise": 0.2, "target_noise_clip": 0.5}
     curves = {}
-    for name, algorithm, extra in (("ours", ours, own), ("sb3", theirs, {})):
+    for name, algorithm, extra in (("ours", ours, own), ("sb3", theirs, {"policy_kwargs": arch})):
         found = []
         for seed in range(3):
             test = EvalCallback(
                 Monitor(gym.make("Pendulum-v1")), n_eval_episodes=10, eval_freq=1500, log_path=str(tmp_path), verbose=0
             )
-            algorithm("MlpPolicy", "Pendulum-v1", seed=seed, policy_kwargs=arch, **settings, **extra).learn(6000, test)
+            algorithm("MlpPolicy", "Pendulum-v1", seed=seed, **settings, **extra).learn(6000, test)
             found.append(np.mean(test.evaluations_results, axis=1))
         curves[name] = np.array(found)  # [seed, test]
     print(curves)

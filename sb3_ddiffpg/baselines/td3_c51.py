@@ -65,7 +65,7 @@ class TD3C51(Baseline):
 
     :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
-    :param policy_delay: Updates of the critics for each of the actor
+    :param policy_delay: Updates of the critics for each of the actor and of the target networks
     :param kwargs: Of ``Baseline`` and ``NoveltyActorCritic``
     """
 
@@ -82,3 +82,7 @@ class TD3C51(Baseline):
         if self._n_critic_updates % self.policy_delay == 0:
             values = self._values(batch, self.actor(batch.observations))
             metrics["actor_loss"].append(self._step_actor(-values.min(dim=0).values.mean()))
+
+    def _update_targets(self) -> None:
+        if self._n_critic_updates % self.policy_delay == 0:
+            super()._update_targets()
