@@ -562,7 +562,10 @@ def test_sacs_entropy_coefficient_follows_its_target():
 @pytest.mark.slow
 @pytest.mark.parametrize(("ours", "theirs"), [(TD3C51, TD3), (SACC51, SAC)])
 def test_pendulum_is_learnt_as_by_sb3(tmp_path, ours, theirs):
-    """Scalar critics, no bonus, SB3's own settings: the same curves within the noise of three seeds, and both learn."""
+    """
+    Scalar critics, no bonus, SB3's own settings: the same curves within the noise of three seeds, and each seed learns. Its last
+    model need not have: SB3's TD3 forgets in between.
+    """
     settings = {"learning_starts": 500, "batch_size": 256, "tau": 0.005, "gamma": 0.98, "learning_rate": 1e-3}
     settings["action_noise"] = NormalActionNoise(np.zeros(1), np.full(1, 0.1)) if ours is TD3C51 else None
     arch = {"net_arch": [64, 64]}
@@ -586,11 +589,11 @@ def test_pendulum_is_learnt_as_by_sb3(tmp_path, ours, theirs):
             test = EvalCallback(
                 Monitor(gym.make("Pendulum-v1")), n_eval_episodes=10, eval_freq=1500, log_path=str(tmp_path), verbose=0
             )
-            algorithm("MlpPolicy", "Pendulum-v1", seed=seed, **settings, **extra).learn(6000, test)
+            algorithm("MlpPolicy", "Pendulum-v1", seed=seed, **settings, **extra).learn(9000, test)
             found.append(np.mean(test.evaluations_results, axis=1))
         curves[name] = np.array(found)  # [seed, test]
     print(curves)
     means, deviations = ({name: f(curve, axis=0) for name, curve in curves.items()} for f in (np.mean, np.std))
     noise = 2 * np.hypot(deviations["ours"], deviations["sb3"]) + 60
     assert (np.abs(means["ours"] - means["sb3"]) < noise).all()
-    assert all(mean[-1] > -400 > mean[0] for mean in means.values())
+    assert all((curve[:, 0] < -400).all() and (curve.max(axis=1) > -400).all() for curve in curves.values())
