@@ -563,8 +563,8 @@ def test_sacs_entropy_coefficient_follows_its_target():
 @pytest.mark.parametrize(("ours", "theirs"), [(TD3C51, TD3), (SACC51, SAC)])
 def test_pendulum_is_learnt_as_by_sb3(tmp_path, ours, theirs):
     """
-    Scalar critics, no bonus, SB3's own settings: the same curves within the noise of three seeds, and each seed learns. Its last
-    model need not have: SB3's TD3 forgets in between.
+    Scalar critics, no bonus, SB3's own settings: the same curves within the noise of three seeds, and each seed learns. Its
+    last model need not have: SB3's TD3 forgets in between.
     """
     settings = {"learning_starts": 500, "batch_size": 256, "tau": 0.005, "gamma": 0.98, "learning_rate": 1e-3}
     settings["action_noise"] = NormalActionNoise(np.zeros(1), np.full(1, 0.1)) if ours is TD3C51 else None
