@@ -18,6 +18,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ddiffpg import DDiffPG
@@ -506,6 +507,72 @@ def test_td3_updates_as_sb3s_does():
     th.testing.assert_close(found[0, :, 0], target)
     expected = sum(th.nn.functional.mse_loss(q, target) for q in q_values)
     th.testing.assert_close(ours.critics.loss(features, actions[None], found)[0], expected)
+
+
+def test_td3_is_sb3s_update_by_update():
+    """Where they coincide: one scalar critic, no noise in the target, no bonus. The same networks after seven updates."""
+    arch = {"net_arch": [16], "activation_fn": th.nn.ReLU, "optimizer_class": th.optim.Adam, "n_critics": 1}
+    own_arch = {
+        "net_arch": [16],
+        "activation_fn": th.nn.ReLU,
+        "critic_activation_fn": th.nn.ReLU,
+        "optimizer_class": th.optim.Adam,
+    }
+    settings = {"policy_delay": 2, "tau": 0.2, "target_policy_noise": 0.0, "learning_rate": 0.01}
+    ours = small(
+        TD3C51,
+        **settings,
+        n_atoms=1,
+        v_min=-50.0,
+        v_max=50.0,
+        n_critics=1,
+        actor_tau=0.2,
+        intrinsic_coef=0.0,
+        reward_scale=1.0,
+        max_grad_norm=1e6,
+        policy_kwargs=own_arch,
+    )
+    ours.learn(40)
+    theirs = TD3("MlpPolicy", DummyVecEnv([TwoEnds] * 4), policy_kwargs=arch, **settings)
+    theirs.set_logger(Logger(None, []))
+
+    def as_theirs(critics, q):
+        for layer, (weight, bias) in enumerate(zip(critics.weights, critics.biases, strict=True)):
+            yield q[2 * layer].weight, weight[0, 0].T
+            yield q[2 * layer].bias, bias[0, 0, 0]
+
+    with th.no_grad():
+        for critics, q in ((ours.critics, theirs.critic.qf0), (ours.policy.critics_target, theirs.critic_target.qf0)):
+            for parameter, value in as_theirs(critics, q):
+                parameter.copy_(value)
+    theirs.actor.load_state_dict(ours.actor.state_dict(), strict=False)
+    theirs.actor_target.load_state_dict(ours.policy.actor_target.state_dict(), strict=False)
+    for optimizer in (ours.actor.optimizer, ours.critics.optimizer):  # which have gone a few steps
+        optimizer.state.clear()
+    ours._n_critic_updates = 0
+
+    batches = [ours.replay_buffer.sample_modes(32, ours.gamma, 1, 1) for _ in range(7)]
+    given = iter(
+        ReplayBufferSamples(
+            ours.actor.features(batch.observations),
+            batch.actions[0],
+            ours.actor.features(batch.next_observations),
+            th.zeros(32, 1),
+            batch.rewards[0, :, None],
+            batch.discounts[0, :, None],
+        )
+        for batch in batches
+    )
+    with patch.object(ours.replay_buffer, "sample_modes", side_effect=batches):
+        ours.train(7, 32)
+    with patch.object(theirs.replay_buffer, "sample", side_effect=lambda *_, **__: next(given)):
+        theirs.train(7, 32)
+    for critics, q in ((ours.critics, theirs.critic.qf0), (ours.policy.critics_target, theirs.critic_target.qf0)):
+        for parameter, value in as_theirs(critics, q):
+            th.testing.assert_close(parameter, value, rtol=1e-4, atol=1e-5)
+    for actor, other in ((ours.actor, theirs.actor), (ours.policy.actor_target, theirs.actor_target)):
+        for (name, value), (_, expected) in zip(actor.mu.state_dict().items(), other.mu.state_dict().items(), strict=True):
+            th.testing.assert_close(value, expected, rtol=1e-4, atol=1e-5, msg=name)
 
 
 def test_td3_waits_with_its_policy():
