@@ -220,10 +220,16 @@ def sized_as(expected: dict[str, Any], part: str, make: Callable[..., Built], *a
     :param args: Its arguments
     :param kwargs: Its arguments
     :return: The part
-    :raises ValueError: If the file has other arrays
+    :raises ValueError: If the file has other arrays, or the part cannot be made without memory
     """
-    with th.device("meta"), preserved_rng():
-        needed = {name: list(value.shape) for name, value in make(*args, **kwargs).state_dict().items()}
+    try:
+        with th.device("meta"), preserved_rng():
+            needed = {name: list(value.shape) for name, value in make(*args, **kwargs).state_dict().items()}
+    except RuntimeError as error:  # somebody's own class looks at values where it is made
+        raise ValueError(
+            f"model.parameters.{part}: its size cannot be told before it is made ({error}): give what it is made with,"
+            " such as custom_objects={'policy_kwargs': ...}, and it is made at once"
+        ) from error
     there = {name: list(np.shape(value)) for name, value in expected.items()}
     if needed != there:
         different = next(name for name in sorted(needed.keys() | there.keys()) if needed.get(name) != there.get(name))

@@ -36,6 +36,7 @@ from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.model_file import build_model, model_tree
 from sb3_ddiffpg.plain_values import from_plain, to_plain
+from sb3_ddiffpg.policies import DiffusionPolicy
 from sb3_ddiffpg.safe_files import _digest, convert, read, remove_unfinished, write
 from sb3_ddiffpg.schedules import LateLinearSchedule
 
@@ -376,6 +377,27 @@ def test_networks_of_ones_own_are_made_as_they_are(trained, tmp_path):
     model = small_model(DummyVecEnv([TwoEnds]), policy_kwargs=kwargs)
     model.export(tmp_path / "model")
     loaded = DDiffPG.load(tmp_path / "model", safe=True, custom_objects={"policy_kwargs": kwargs})
+    obs = some_observations()
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+
+
+class LooksAtValues(DiffusionPolicy):
+    """Somebody's own, for which the size of its networks cannot be told beforehand."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        assert next(self.actor.parameters()).sum().item() != 0
+
+
+def test_a_policy_of_ones_own_is_made_as_it_is_once_its_arguments_are_given(tmp_path):
+    kwargs = {"net_arch": [16]}
+    model = DDiffPG(LooksAtValues, DummyVecEnv([TwoEnds]), policy_kwargs=kwargs)
+    model.export(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"policy: its size .*custom_objects={'policy_kwargs': ...}"):
+        DDiffPG.load(tmp_path / "model", safe=True, custom_objects={"policy": LooksAtValues})
+    custom = {"policy": LooksAtValues, "policy_kwargs": kwargs}
+    loaded = DDiffPG.load(tmp_path / "model", safe=True, custom_objects=custom)
+    assert isinstance(loaded.policy, LooksAtValues)
     obs = some_observations()
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
 
