@@ -7,10 +7,11 @@ from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from sb3_ddiffpg.clustering import Inheritance
 from sb3_ddiffpg.modes import Mode, default_name
-from sb3_ddiffpg.safe_files import convert
+from sb3_ddiffpg.safe_files import check_array, convert
 
 #: What can happen to a mode; those of the second row by hand
 EVENT_KINDS = (
@@ -58,9 +59,20 @@ class ModeState:
     success_rate: float
 
 
+#: Of ``ModeState``: how each field is kept, in memory and in a file
+_COLUMNS = {"step": "q", "number": "q", "n_trajectories": "q", "success_rate": "d"}
+
+
+class _Columns(msgspec.Struct, forbid_unknown_fields=True):
+    step: np.ndarray
+    number: np.ndarray
+    n_trajectories: np.ndarray
+    success_rate: np.ndarray
+
+
 class _State(msgspec.Struct, forbid_unknown_fields=True):
     events: list[ModeEvent]
-    states: list[ModeState]
+    states: list[ModeState] | _Columns  # a list in older files
 
 
 class ModeHistory:
@@ -74,7 +86,7 @@ class ModeHistory:
     def __init__(self, events: Iterable[ModeEvent] = (), states: Iterable[ModeState] = ()) -> None:
         self.events = list(events)
         # A long run has a hundred thousand states: a column of numbers for each field, a tenth of the objects' memory
-        self._columns: list[array[Any]] = [array("q"), array("q"), array("q"), array("d")]
+        self._columns: list[array[Any]] = [array(kind) for kind in _COLUMNS.values()]
         self._append(states)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -103,7 +115,8 @@ class ModeHistory:
         """
         :return: All of it, for ``from_state``
         """
-        return {"events": [asdict(event) for event in self.events], "states": [asdict(state) for state in self.states]}
+        columns = {name: np.array(column) for name, column in zip(_COLUMNS, self._columns, strict=True)}
+        return {"events": [asdict(event) for event in self.events], "states": columns}
 
     @classmethod
     def from_state(cls, state: Any) -> "ModeHistory":
@@ -116,10 +129,16 @@ class ModeHistory:
         unknown = {event.kind for event in known.events} - set(EVENT_KINDS)
         if unknown:
             raise ValueError(f"history: nothing that can happen to a mode is called {sorted(unknown)}")
-        try:
-            return cls(known.events, known.states)
-        except OverflowError:
-            raise ValueError("history: a number of a state is beyond 64 bits") from None
+        if isinstance(known.states, list):
+            try:
+                return cls(known.events, known.states)
+            except OverflowError:
+                raise ValueError("history: a number of a state is beyond 64 bits") from None
+        history = cls(known.events)
+        for column, (name, kind) in zip(history._columns, _COLUMNS.items(), strict=True):
+            found = getattr(known.states, name)
+            column.frombytes(check_array(found, kind, [known.states.step.size], f"history.{name}").tobytes())
+        return history
 
     def share_kept(self, min_trajectories: int = 20, from_step: int = 0) -> float:
         """

@@ -2,11 +2,12 @@
 
 import pickle
 import tracemalloc
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 import torch as th
-from environments import TwoEnds, small_model, some_observations
+from environments import TwoEnds, copied, small_model, some_observations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from planar import belongings, planar_model, route_of, said, same, walk
@@ -16,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_ddiffpg import DDiffPG, Mode, reclustering
 from sb3_ddiffpg.history import ModeEvent, ModeHistory, ModeState
 from sb3_ddiffpg.modes import Outcome
+from sb3_ddiffpg.safe_files import read, write
 
 # ---------------------------------------------------------------------- names
 
@@ -276,6 +278,30 @@ def test_a_history_of_impossible_numbers_is_refused():
     state = {"step": 2**70, "number": 0, "n_trajectories": 1, "success_rate": 1.0}
     with pytest.raises(ValueError, match="history"):
         ModeHistory.from_state({"events": [], "states": [state]})
+    columns = ModeHistory(states=[ModeState(5, 0, 4, 0.5)]).state_dict()["states"]
+    for change in (
+        {"number": np.zeros(2, int)},
+        {"step": np.zeros(())},
+        {"success_rate": np.zeros(1, int)},
+        {"x": np.zeros(1)},
+    ):
+        with pytest.raises(ValueError, match="history"):
+            ModeHistory.from_state({"events": [], "states": {**columns, **change}})
+
+
+def test_a_file_holds_the_history_of_a_long_run(tmp_path):
+    """Twenty modes at each of 15,000 re-clusterings."""
+    history = ModeHistory(states=(ModeState(step, number, 100, 0.123456789) for step in range(15_000) for number in range(20)))
+    write(tmp_path / "history", "history", history.state_dict())
+    assert ModeHistory.from_state(read(tmp_path / "history", "history")).states[::997] == history.states[::997]
+
+
+def test_a_history_of_an_older_file():
+    """Which has a list of records."""
+    states = [ModeState(5, 0, 4, 0.5), ModeState(6, 1, 2, float("nan"))]
+    old = ModeHistory.from_state({"events": [], "states": [asdict(state) for state in states]})
+    new = ModeHistory.from_state(copied(old.state_dict()))
+    assert str(old.states) == str(new.states) == str(states)
 
 
 # ---------------------------------------------------------------------- choosing
