@@ -30,7 +30,7 @@ fuzz: .venv/.installed-dev
 
 # the fast tests with the lowest versions that setup.cfg accepts
 oldest:
-	$(PYTHON) -m venv .venv-oldest
+	$(PYTHON) -m venv --clear .venv-oldest
 	.venv-oldest/bin/pip install --quiet uv
 	.venv-oldest/bin/uv pip install --python .venv-oldest/bin/python --quiet --resolution lowest-direct -e ".[all,dev]"
 	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest -n 2

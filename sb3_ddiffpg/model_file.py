@@ -35,6 +35,8 @@ MOST = {
 _OF_THE_MACHINE = ("fused", "foreach", "capturable")
 # Of what optimisers gather
 _NOT_NEGATIVE = ("step", "exp_avg_sq", "max_exp_avg_sq")
+# Parts of a model, and the argument by which one of one's own comes
+_MADE_WITH = {"policy": "policy_kwargs", "novelty_model": "novelty"}
 # Of the constructor, but not the model's: given again when it is loaded
 GIVEN_AT_LOADING = {"policy", "env", "device", "tensorboard_log", "_init_setup_model"}
 
@@ -161,7 +163,8 @@ def build_model(
         model.n_envs = saved.n_envs if env is None else env.num_envs
         model.load_state_tree(saved.state)
         # Networks of one's own may need values where they are made, and are trusted
-        model._in_file = None if {"policy_kwargs", "novelty"} & given.keys() else saved.parameters
+        trusted = [part for part, argument in _MADE_WITH.items() if argument in given]
+        model._in_file = {**saved.parameters, **dict.fromkeys(trusted)}
         model._setup_model()
         model._in_file = None
         if model.action_noise is not None:
@@ -169,7 +172,11 @@ def build_model(
         parameters = _parameters(model, saved.parameters)
         model.set_parameters(parameters, exact_match=True, device=model.device)
     except (TypeError, AttributeError, AssertionError, LookupError, RuntimeError, ArithmeticError, MemoryError) as error:
-        raise ValueError(f"model: its arguments make no {algorithm.__name__}: {error!r}") from error
+        own = "policy" in (custom_objects or {}) and "policy_kwargs" not in given
+        hint = (
+            ". A policy that looks at values where it is made needs custom_objects={'policy_kwargs': ...} too" if own else ""
+        )
+        raise ValueError(f"model: its arguments make no {algorithm.__name__}: {error!r}{hint}") from error
     if env is not None and saved.normalizer is not None:  # last: the environments may be somebody's who goes on with them
         restore_normalization(_normalizer_of(env), saved.normalizer.statistics)
     return model
@@ -220,16 +227,10 @@ def sized_as(expected: dict[str, Any], part: str, make: Callable[..., Built], *a
     :param args: Its arguments
     :param kwargs: Its arguments
     :return: The part
-    :raises ValueError: If the file has other arrays, or the part cannot be made without memory
+    :raises ValueError: If the file has other arrays
     """
-    try:
-        with th.device("meta"), preserved_rng():
-            needed = {name: list(value.shape) for name, value in make(*args, **kwargs).state_dict().items()}
-    except RuntimeError as error:  # somebody's own class looks at values where it is made
-        raise ValueError(
-            f"model.parameters.{part}: its size cannot be told before it is made ({error}): give what it is made with,"
-            " such as custom_objects={'policy_kwargs': ...}, and it is made at once"
-        ) from error
+    with th.device("meta"), preserved_rng():
+        needed = {name: list(value.shape) for name, value in make(*args, **kwargs).state_dict().items()}
     there = {name: list(np.shape(value)) for name, value in expected.items()}
     if needed != there:
         different = next(name for name in sorted(needed.keys() | there.keys()) if needed.get(name) != there.get(name))

@@ -41,8 +41,8 @@ class SavableAlgorithm(OffPolicyAlgorithm):
     #: Networks of the policy that follow others slowly and only train: what they follow, by name
     target_networks: ClassVar[dict[str, str]] = {}
     _saves_to_act = False
-    #: While it is made of a file: the file's arrays, by part
-    _in_file: dict[str, dict[str, Any]] | None = None
+    #: While it is made of a file: the file's arrays, by part; None for one of one's own
+    _in_file: dict[str, dict[str, Any] | None] | None = None
     #: Of ``learn``, for callbacks: what they hold is given back however it ends
     until_learn_ends: contextlib.ExitStack
     #: Attributes that are plain values, and their types
@@ -245,9 +245,10 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         :param kwargs: Its arguments
         :return: The part
         """
-        if self._in_file is None:
+        expected = None if self._in_file is None else self._in_file.get(part, {})
+        if expected is None:
             return make(*args, **kwargs)
-        return sized_as(self._in_file.get(part, {}), part, make, *args, **kwargs)
+        return sized_as(expected, part, make, *args, **kwargs)
 
     def state_tree(self) -> dict[str, Any]:
         """

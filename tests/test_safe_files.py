@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import zipfile
+from functools import partialmethod
 
 import numpy as np
 import pytest
@@ -384,22 +385,31 @@ def test_networks_of_ones_own_are_made_as_they_are(trained, tmp_path):
 class LooksAtValues(DiffusionPolicy):
     """Somebody's own, for which the size of its networks cannot be told beforehand."""
 
-    def __init__(self, *args, **kwargs):
+    def __init__(self, *args, look=th.Tensor.item, **kwargs):
         super().__init__(*args, **kwargs)
-        assert next(self.actor.parameters()).sum().item() != 0
+        assert look(next(self.actor.parameters()).detach().sum()) != 0
+        self._constructor["look"] = look
 
 
-def test_a_policy_of_ones_own_is_made_as_it_is_once_its_arguments_are_given(tmp_path):
-    kwargs = {"net_arch": [16]}
-    model = DDiffPG(LooksAtValues, DummyVecEnv([TwoEnds]), policy_kwargs=kwargs)
+@pytest.mark.parametrize("look", [th.Tensor.item, th.Tensor.numpy])
+def test_a_policy_of_ones_own_is_made_as_it_is_once_its_arguments_are_given(tmp_path, look):
+    kwargs = {"net_arch": [16], "look": look}
+    model = DDiffPG(LooksAtValues, DummyVecEnv([TwoEnds]), policy_kwargs={"net_arch": [16]})
     model.export(tmp_path / "model")
-    with pytest.raises(ValueError, match=r"policy: its size .*custom_objects={'policy_kwargs': ...}"):
-        DDiffPG.load(tmp_path / "model", safe=True, custom_objects={"policy": LooksAtValues})
-    custom = {"policy": LooksAtValues, "policy_kwargs": kwargs}
-    loaded = DDiffPG.load(tmp_path / "model", safe=True, custom_objects=custom)
+    own = type("Own", (LooksAtValues,), {"__init__": partialmethod(LooksAtValues.__init__, look=look)})
+    with pytest.raises(ValueError, match=r"needs custom_objects={'policy_kwargs': ...} too"):
+        DDiffPG.load(tmp_path / "model", safe=True, custom_objects={"policy": own})
+    loaded = DDiffPG.load(tmp_path / "model", safe=True, custom_objects={"policy": LooksAtValues, "policy_kwargs": kwargs})
     assert isinstance(loaded.policy, LooksAtValues)
     obs = some_observations()
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+
+
+def test_a_policy_of_ones_own_does_not_let_a_small_file_ask_for_all_of_the_memory(tmp_path):
+    tree = read_back(small_model(DummyVecEnv([TwoEnds]), novelty="rnd"))
+    tree["arguments"]["novelty_kwargs"] = {"dict": {"net_arch": [10**6, 10**6]}}
+    with pytest.raises(ValueError, match=r"model.parameters.novelty_model.*accepted is"):
+        build_model(DDiffPG, tree, custom_objects={"policy_kwargs": {"net_arch": [16]}})
 
 
 def test_a_schedule_of_ones_own_does_not_let_a_small_file_ask_for_all_of_the_memory(trained):
