@@ -483,6 +483,14 @@ def test_the_consistency_loss_makes_the_actor_a_model_of_the_buffer():
 # ------------------------------------------------------------------ TD3 and SAC
 
 
+def in_sb3s(critics, networks):
+    """Parameters of SB3's networks, one a twin, and ours that are the same."""
+    for layer, (weight, bias) in enumerate(zip(critics.weights, critics.biases, strict=True)):
+        for twin, network in enumerate(networks):
+            yield network[2 * layer].weight, weight[0, twin].T
+            yield network[2 * layer].bias, bias[0, twin, 0]
+
+
 def test_td3_updates_as_sb3s_does():
     """Scalar critics, the same networks and batch: the same losses."""
     arch = {"net_arch": [16], "activation_fn": th.nn.ReLU}
@@ -490,10 +498,8 @@ def test_td3_updates_as_sb3s_does():
     ours = small(TD3C51, n_atoms=1, v_min=-10.0, v_max=10.0, policy_kwargs=kwargs)
     theirs = TD3("MlpPolicy", DummyVecEnv([TwoEnds] * 4), policy_kwargs=arch, target_policy_noise=0.0)
     with th.no_grad():
-        for layer, (weight, bias) in enumerate(zip(ours.critics.weights, ours.critics.biases, strict=True)):
-            for twin, q in enumerate([theirs.critic.qf0, theirs.critic.qf1]):
-                q[2 * layer].weight.copy_(weight[0, twin].T)
-                q[2 * layer].bias.copy_(bias[0, twin, 0])
+        for parameter, value in in_sb3s(ours.critics, [theirs.critic.qf0, theirs.critic.qf1]):
+            parameter.copy_(value)
         theirs.actor.mu.load_state_dict(ours.actor.mu.state_dict())
     obs = th.rand(9, 2) * 4 - 2
     scaled = ours.actor.features(obs)
@@ -536,14 +542,9 @@ def test_td3_is_sb3s_update_by_update():
     theirs = TD3("MlpPolicy", DummyVecEnv([TwoEnds] * 4), policy_kwargs=arch, **settings)
     theirs.set_logger(Logger(None, []))
 
-    def as_theirs(critics, q):
-        for layer, (weight, bias) in enumerate(zip(critics.weights, critics.biases, strict=True)):
-            yield q[2 * layer].weight, weight[0, 0].T
-            yield q[2 * layer].bias, bias[0, 0, 0]
-
     with th.no_grad():
         for critics, q in ((ours.critics, theirs.critic.qf0), (ours.policy.critics_target, theirs.critic_target.qf0)):
-            for parameter, value in as_theirs(critics, q):
+            for parameter, value in in_sb3s(critics, [q]):
                 parameter.copy_(value)
     theirs.actor.load_state_dict(ours.actor.state_dict(), strict=False)
     theirs.actor_target.load_state_dict(ours.policy.actor_target.state_dict(), strict=False)
@@ -568,7 +569,7 @@ def test_td3_is_sb3s_update_by_update():
     with patch.object(theirs.replay_buffer, "sample", side_effect=lambda *_, **__: next(given)):
         theirs.train(7, 32)
     for critics, q in ((ours.critics, theirs.critic.qf0), (ours.policy.critics_target, theirs.critic_target.qf0)):
-        for parameter, value in as_theirs(critics, q):
+        for parameter, value in in_sb3s(critics, [q]):
             th.testing.assert_close(parameter, value, rtol=1e-4, atol=1e-5)
     for actor, other in ((ours.actor, theirs.actor), (ours.policy.actor_target, theirs.actor_target)):
         for (name, value), (_, expected) in zip(actor.mu.state_dict().items(), other.mu.state_dict().items(), strict=True):

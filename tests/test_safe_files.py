@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import zipfile
-from functools import partialmethod
 
 import numpy as np
 import pytest
@@ -382,24 +381,21 @@ def test_networks_of_ones_own_are_made_as_they_are(trained, tmp_path):
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
 
 
-class LooksAtValues(DiffusionPolicy):
-    """Somebody's own, for which the size of its networks cannot be told beforehand."""
-
-    def __init__(self, *args, look=th.Tensor.item, **kwargs):
-        super().__init__(*args, **kwargs)
-        assert look(next(self.actor.parameters()).detach().sum()) != 0
-        self._constructor["look"] = look
-
-
 @pytest.mark.parametrize("look", [th.Tensor.item, th.Tensor.numpy])
 def test_a_policy_of_ones_own_is_made_as_it_is_once_its_arguments_are_given(tmp_path, look):
-    kwargs = {"net_arch": [16], "look": look}
+    class LooksAtValues(DiffusionPolicy):
+        """Somebody's own, for which the size of its networks cannot be told beforehand."""
+
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            assert look(next(self.actor.parameters()).detach().sum()) != 0
+
+    custom = {"policy": LooksAtValues, "policy_kwargs": {"net_arch": [16]}}
     model = DDiffPG(LooksAtValues, DummyVecEnv([TwoEnds]), policy_kwargs={"net_arch": [16]})
     model.export(tmp_path / "model")
-    own = type("Own", (LooksAtValues,), {"__init__": partialmethod(LooksAtValues.__init__, look=look)})
     with pytest.raises(ValueError, match=r"needs custom_objects={'policy_kwargs': ...} too"):
-        DDiffPG.load(tmp_path / "model", safe=True, custom_objects={"policy": own})
-    loaded = DDiffPG.load(tmp_path / "model", safe=True, custom_objects={"policy": LooksAtValues, "policy_kwargs": kwargs})
+        DDiffPG.load(tmp_path / "model", safe=True, custom_objects={"policy": LooksAtValues})
+    loaded = DDiffPG.load(tmp_path / "model", safe=True, custom_objects=custom)
     assert isinstance(loaded.policy, LooksAtValues)
     obs = some_observations()
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])

@@ -79,10 +79,13 @@ class TD3C51(Baseline):
 
     def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
         self._n_critic_updates += 1
-        if self._n_critic_updates % self.policy_delay == 0:
+        if self._policy_is_due():
             values = self._values(batch, self.actor(batch.observations))
             metrics["actor_loss"].append(self._step_actor(-values.min(dim=0).values.mean()))
 
     def _update_targets(self) -> None:
-        if self._n_critic_updates % self.policy_delay == 0:
+        if self._policy_is_due():
             super()._update_targets()
+
+    def _policy_is_due(self) -> bool:
+        return self._n_critic_updates % self.policy_delay == 0

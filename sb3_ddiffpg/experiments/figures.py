@@ -70,7 +70,7 @@ def curves(runs: Sequence[Recorded], measure: str, against: str = "step") -> Fig
         if against == "step":
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     if not apart:
-        drawn = by(variant_of, known)  # a union has no curve
+        drawn = {variant_of(run) for run in known}  # a union has no curve
         _one_legend(figure, panels, {variant: color for variant, color in colors.items() if variant in drawn})
     return figure
 
