@@ -324,11 +324,11 @@ def _numpy_dtype(tensor: th.Tensor) -> np.dtype:
 def _optimizer(optimizer: th.optim.Optimizer, own: dict[str, Any], tree: dict[str, Any], what: str) -> dict[str, Any]:
     saved = convert(tree, dict[str, Any], what)
     states, groups = (convert(saved.get(key), kind, what) for key, kind in (("state", dict[str, Any]), ("groups", list[Any])))
-    parameters = [each for group in optimizer.param_groups for each in group["params"]]
     if len(groups) != len(own["param_groups"]):
         raise ValueError(f"{what}: {len(groups)} groups, the optimizer has {len(own['param_groups'])}")
     restored = []
-    for group, before in zip(groups, own["param_groups"], strict=True):
+    gathers: dict[str, dict[str, Any]] = {}
+    for group, before, present in zip(groups, own["param_groups"], optimizer.param_groups, strict=True):
         values = {key: from_plain(value) for key, value in convert(group, dict[str, Any], what).items()}
         values |= {key: before[key] for key in _OF_THE_MACHINE if key in before}
         if set(values) != set(before) or values["params"] != before["params"]:
@@ -336,35 +336,44 @@ def _optimizer(optimizer: th.optim.Optimizer, own: dict[str, Any], tree: dict[st
         for key, value in values.items():
             if isinstance(before[key], (float, bool, tuple)) and not isinstance(value, (type(before[key]), int)):
                 raise ValueError(f"{what}.{key}: {value!r} given, where {before[key]!r} was")
-        _check_settings(optimizer, values, what)
+        gathered = _gathered_in_a_step(type(optimizer), values, present["params"], what)
+        gathers.update(zip(map(str, values["params"]), gathered, strict=True))
         restored.append(values)
-    if len({tuple(sorted(each)) for each in states.values()}) > 1:
-        raise ValueError(f"{what}: it has gathered different things of different parameters")
-    state: dict[int, dict[str, th.Tensor]] = {}
+    state = {}
     for index, each in states.items():
-        if not index.isdecimal() or int(index) >= len(parameters):
-            raise ValueError(f"{what}: {index[:20]!r} is none of its {len(parameters)} parameters")
-        shape, dtype = list(parameters[int(index)].shape), _numpy_dtype(parameters[int(index)])
-        arrays = {key: convert(array, np.ndarray, what) for key, array in convert(each, dict[str, Any], what).items()}
-        for key, array in arrays.items():
-            check_array(array, dtype if array.ndim else array.dtype, shape if array.ndim else [], f"{what}.{key}")
-            if not np.isfinite(array).all() or (key in _NOT_NEGATIVE and (array < 0).any()):
-                raise ValueError(f"{what}.{key}: there are numbers that cannot be")
-        state[int(index)] = {key: th.from_numpy(array.copy()) for key, array in arrays.items()}
+        if index not in gathers:
+            raise ValueError(f"{what}: {index[:20]!r} is none of its {len(gathers)} parameters")
+        if (there := set(convert(each, dict[str, Any], what))) != set(gathers[index]):
+            raise ValueError(f"{what}: it has gathered {sorted(there)}; accepted are {sorted(gathers[index])}")
+        state[int(index)] = {key: _gathered(each[key], like, key, what) for key, like in gathers[index].items()}
     return {"state": state, "param_groups": restored}
 
 
-def _check_settings(optimizer: th.optim.Optimizer, values: dict[str, Any], what: str) -> None:
-    """The optimiser's own constructor knows what they may be."""
-    kind: Any = type(optimizer)
-    accepted = inspect.signature(kind.__init__).parameters
+def _gathered_in_a_step(kind: Any, values: dict[str, Any], params: list[th.Tensor], what: str) -> list[dict[str, Any]]:
+    """For each parameter; which settings there may be is known by the optimiser's own constructor, and its step."""
+    accepted = set(inspect.signature(kind.__init__).parameters) - {"params"}
+    params = [th.zeros_like(each, requires_grad=True) for each in params]
     try:
         for value in values.values():
             if isinstance(value, (float, tuple)) and not np.isfinite(value).all():
                 raise ValueError(f"{value} is not finite")
-        kind([th.zeros(1)], **{name: value for name, value in values.items() if name in accepted and name != "params"})
+        optimizer = kind(params, **{name: value for name, value in values.items() if name in accepted})
+        for each in params:
+            each.grad = th.zeros_like(each)
+        optimizer.step()
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{what}: {error}") from None
+    return [dict(optimizer.state[each]) for each in params]
+
+
+def _gathered(value: Any, like: Any, key: str, what: str) -> Any:
+    if isinstance(like, th.Tensor):
+        found: Any = _tensor(value, like, f"{what}.{key}")
+    else:  # some count in plain numbers
+        found = convert(value, type(like), f"{what}.{key}")
+    if key in _NOT_NEGATIVE and (found < 0 if isinstance(found, (int, float)) else bool((found < 0).any())):
+        raise ValueError(f"{what}.{key}: there are numbers that are negative")
+    return found
 
 
 # ------------------------------------------------------------------ normalisation

@@ -371,7 +371,7 @@ def test_networks_without_hidden_layer_are_refused(net_arch):
     "policy_kwargs",
     [
         {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": 0.0}},
-        {"optimizer_class": th.optim.Adam},
+        {"optimizer_class": th.optim.Adam, "optimizer_kwargs": {"amsgrad": True}},
         {"optimizer_class": th.optim.SGD, "optimizer_kwargs": {"momentum": 0.9}},
         {"optimizer_class": RMSpropTFLike, "optimizer_kwargs": {"eps": 1e-5}},
         {"activation_fn": th.nn.Tanh, "critic_activation_fn": th.nn.ELU},
@@ -383,9 +383,14 @@ def test_optimisers_and_activations(policy_kwargs, tmp_path):
     model = small_model(env, policy_kwargs={"net_arch": [8], **policy_kwargs}).learn(250)
     assert len(model.modes) >= 1
     model.save(tmp_path / "model")
-    loaded = DDiffPG.load(tmp_path / "model", env=env)
-    assert_same_state(state_of(loaded), state_of(model))
-    loaded.learn(8)
+    model.export(tmp_path / "exported", optimizers=True)
+    own = {"policy_kwargs": model.policy_kwargs}
+    for loaded in (
+        DDiffPG.load(tmp_path / "model", env=env),
+        DDiffPG.load(tmp_path / "exported", env=env, safe=True, custom_objects=own),
+    ):
+        assert_same_state(state_of(loaded), state_of(model))
+        loaded.learn(8)
 
 
 @pytest.mark.parametrize(
