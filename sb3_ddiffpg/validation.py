@@ -32,6 +32,11 @@ def _is_rate(value: Any) -> bool:
     return callable(value) or (_is_number(value) and 0 <= value < np.inf)
 
 
+def _is_frequency(value: Any) -> bool:
+    frequency, unit = value if isinstance(value, tuple) and len(value) == 2 else (value, "step")
+    return _is_integer(frequency) and frequency >= 1 and getattr(unit, "value", unit) in ("step", "episode")
+
+
 # Names of arguments, what they accept in words and as a test
 RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     (
@@ -49,6 +54,7 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
         "be an integer of at least 0",
         lambda value: _is_integer(value) and value >= 0,
     ),
+    (("train_freq",), "be an integer of at least 1, or a tuple of one and 'step' or 'episode'", _is_frequency),
     (("gradient_steps",), "be an integer of at least -1", lambda value: _is_integer(value) and value >= -1),
     (
         (

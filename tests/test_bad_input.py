@@ -67,8 +67,7 @@ BAD_ARGUMENTS = [
     ("optimize_memory_usage", True),
     ("replay_buffer_class", ReplayBuffer),
     ("replay_buffer_class", "ModeReplayBuffer"),
-    ("train_freq", (1, "minute")),
-    ("train_freq", 1.5),
+    *(("train_freq", value) for value in ((1, "minute"), (1,), (0, "episode"), 1.5, 0, -3, True)),
     *(("mode_features", value) for value in ([2], [-1], [], [[0]], [0.5], "position", 0, lambda obs: obs.sum())),
 ]
 
