@@ -64,6 +64,8 @@ def mutate(tree, data):
             walk(node[key])
 
     walk(tree)
+    if not places:  # all of it was taken out before
+        return
     node, key = places[data.draw(st.integers(0, len(places) - 1))]
     before = node[key]
     other = st.sampled_from([None, True, -1, 0, 10**12, 2**70, float("nan"), 1e300, "", "x", [], {}, np.zeros(3, np.float32)])
