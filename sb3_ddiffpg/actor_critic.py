@@ -237,6 +237,9 @@ class NoveltyActorCritic(SavableAlgorithm):
 
     def _check_arguments(self) -> None:
         check_arguments(self, self._policy_arguments)
+        space: Any = self.action_space
+        if (flat := np.flatnonzero(space.low >= space.high)).size:
+            raise ValueError(f"action_space: low is not below high in components {flat.tolist()}; accepted are ranges")
 
     def _setup_model(self) -> None:
         self._check_arguments()

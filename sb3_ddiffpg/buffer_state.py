@@ -217,6 +217,8 @@ def _check(buffer: ModeReplayBuffer, state: _Buffer, trajectories: list[Trajecto
     """All rows are somebody's, once, and all that is said about them fits."""
     if state.n_path_points != buffer.n_path_points:
         raise ValueError(f"replay buffer: n_path_points={state.n_path_points} there, {buffer.n_path_points} in the model")
+    if len(state.mode_rows) != len(buffer.mode_rows):
+        raise ValueError(f"replay buffer: of {len(state.mode_rows)} modes, the model has {len(buffer.mode_rows)}")
     _check_arrays(buffer, state)
     pos, n_modes = len(state.parts[0]), len(state.mode_rows)
     empty = np.zeros(0, dtype=np.int32)

@@ -77,7 +77,7 @@ def checkpoint_files(folder: str | Path) -> list[Path]:
     :param folder: Where a ``RunCheckpointCallback`` writes
     :return: Its checkpoints, the newest first
     """
-    return sorted(Path(folder).glob(NAMES), reverse=True)
+    return sorted((path for path in Path(folder).glob(NAMES) if _n_steps(path) >= 0), key=_n_steps, reverse=True)
 
 
 def read_checkpoint(path: str | Path) -> tuple[Path, _Checkpoint]:
@@ -213,7 +213,7 @@ def nested_callbacks(callback: BaseCallback | None) -> list[BaseCallback]:
     if isinstance(callback, CallbackList):
         return [each for child in callback.callbacks for each in nested_callbacks(child)]
     children = (getattr(callback, name, None) for name in ("callback", "callback_on_new_best"))
-    return [callback, *(each for child in children for each in nested_callbacks(child))]
+    return [callback, *(each for child in children if isinstance(child, BaseCallback) for each in nested_callbacks(child))]
 
 
 def _gathered(callback: BaseCallback) -> list[str]:
@@ -275,7 +275,7 @@ def _refuse_another_run(folder: Path, run_id: str, n_steps: int) -> list[Path]:
 
 
 def _n_steps(path: Path) -> int:
-    """Environment steps of a checkpoint, by its name; -1 for a name that is none."""
+    """Environment steps of a checkpoint, by its name; -1 for another name, such as of somebody's copy."""
     digits = path.stem.removeprefix("checkpoint_")
     return int(digits) if digits.isdecimal() else -1
 
@@ -382,7 +382,7 @@ class RunCheckpointCallback(BaseCallback):
         except Exception as error:  # a full disk, or what environments or callbacks have come to hold: not worth the run
             self._warn_of(error)
             return False
-        others = [each for each in checkpoint_files(self.folder) if each != path and _n_steps(each) >= 0]
+        others = [each for each in checkpoint_files(self.folder) if each != path]
         damaged = [each for each in self._damaged if each in others]
         sound = [each for each in others if each not in damaged]
         for old in [*damaged, *sound[self.keep - 1 :]]:

@@ -3,7 +3,7 @@
 import inspect
 import warnings
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -27,7 +27,7 @@ KIND = "model"
 # Beyond these a small file would take hours or all of the memory
 MOST_ENVS = 2**16
 MOST = {
-    **dict.fromkeys(("n_diffusion_steps", "n_action_gradient_steps", "n_candidates"), 10_000),
+    **dict.fromkeys(("n_diffusion_steps", "n_action_gradient_steps", "n_candidates", "n_path_points"), 10_000),
     **dict.fromkeys(("n_steps", "mode_n_steps", "exploration_n_steps", "gradient_steps"), 100_000),
     "batch_size": 2**24,
 }
@@ -35,6 +35,10 @@ MOST = {
 _OF_THE_MACHINE = ("fused", "foreach", "capturable")
 # Of what optimisers gather
 _NOT_NEGATIVE = ("step", "exp_avg_sq", "max_exp_avg_sq")
+# Of them, what no optimiser needs more of, and by which parameters would become infinite in a few steps
+_LARGEST_SETTING = 1e6
+# Of arrays of numbers
+_DTYPES = {str(np.dtype(kind)) for kind in "?bhilqBHILQefd"}
 # Parts of a model, and the argument by which one of one's own comes
 _MADE_WITH = {"policy": "policy_kwargs", "novelty_model": "novelty"}
 # Of the constructor, but not the model's: given again when it is loaded
@@ -142,9 +146,7 @@ def build_model(
     if unknown:
         raise ValueError(f"model.arguments: {sorted(unknown)} are no arguments of {algorithm.__name__}")
     given = dict(custom_objects or {})
-    policy = given.pop("policy", saved.policy)
-    if policy is None:
-        raise ValueError("the policy is a class of one's own, which no file holds: give custom_objects={'policy': ...}")
+    policy = given.pop("policy", None) or _policy_class(algorithm, saved.policy)
     arguments = {**_arguments(saved.arguments, {**given, **changes}), **given, **changes}
     _check_arguments({name: each for name, each in arguments.items() if name not in {**given, **changes}}, saved.parameters)
     if not 1 <= saved.n_envs <= MOST_ENVS:
@@ -182,6 +184,16 @@ def build_model(
     return model
 
 
+def _policy_class(algorithm: Any, name: str | None) -> type:
+    """A class may have several names, of which some are not for all spaces."""
+    if name is None:
+        raise ValueError("the policy is a class of one's own, which no file holds: give custom_objects={'policy': ...}")
+    if name not in algorithm.policy_aliases:
+        raise ValueError(f"model.policy: {name[:50]!r} given; accepted are {sorted(algorithm.policy_aliases)}")
+    found: type = algorithm.policy_aliases[name]
+    return found
+
+
 def _arguments(plain: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     arguments = {}
     for name, each in plain.items():
@@ -200,8 +212,10 @@ def _arguments(plain: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
 
 def _check_arguments(arguments: dict[str, Any], parameters: dict[str, dict[str, Any]]) -> None:
     """Those by which a small file could ask for hours."""
+    of_buffer = arguments.get("replay_buffer_kwargs")
     for name, most in MOST.items():
-        if isinstance(value := arguments.get(name), int) and value > most:
+        value = {**(of_buffer if isinstance(of_buffer, dict) else {}), **arguments}.get(name)
+        if isinstance(value, int) and value > most:
             raise ValueError(f"model.arguments.{name}: {value} given; accepted is at most {most} in a file")
     n_arrays = sum(map(len, parameters.values()))
     for name in ("policy_kwargs", "novelty_kwargs"):
@@ -264,7 +278,7 @@ def _space(tree: Any) -> Any:
     try:
         match saved:
             case _Space(kind="Box", low=np.ndarray() as low, high=np.ndarray() as high, dtype=str(dtype)):
-                if low.shape != high.shape or np.dtype(dtype).kind not in "biuf":
+                if low.shape != high.shape or dtype not in _DTYPES:
                     raise ValueError(f"bounds of shapes {low.shape} and {high.shape}, of {dtype}")
                 return spaces.Box(low, high, dtype=np.dtype(dtype).type)
             case _Space(kind="Discrete", n=[n, start]):
@@ -274,7 +288,7 @@ def _space(tree: Any) -> Any:
             case _Space(kind="MultiBinary", shape=[_, *_] as shape) if np.prod(shape, dtype=float) < 2**31:
                 return spaces.MultiBinary(shape if saved.n is None else shape[0])
             case _Space(kind="Dict", parts=dict(parts)):
-                return spaces.Dict({key: _space(each) for key, each in parts.items()})
+                return spaces.Dict([(key, _space(each)) for key, each in parts.items()])  # a dict would be sorted
     except (AssertionError, TypeError, OverflowError, ValueError) as error:
         raise ValueError(f"space: {error}") from None
     raise ValueError(f"space: {saved.kind[:50]!r} of this form is unknown")
@@ -355,8 +369,8 @@ def _gathered_in_a_step(kind: Any, values: dict[str, Any], params: list[th.Tenso
     params = [th.zeros_like(each, requires_grad=True) for each in params]
     try:
         for value in values.values():
-            if isinstance(value, (float, tuple)) and not np.isfinite(value).all():
-                raise ValueError(f"{value} is not finite")
+            if isinstance(value, (int, float, tuple)) and not all(abs(each) <= _LARGEST_SETTING for each in np.ravel(value)):
+                raise ValueError(f"{str(value)[:100]} given; accepted are numbers up to {_LARGEST_SETTING:g}")
         optimizer = kind(params, **{name: value for name, value in values.items() if name in accepted})
         for each in params:
             each.grad = th.zeros_like(each)
@@ -378,7 +392,13 @@ def _gathered(value: Any, like: Any, key: str, what: str) -> Any:
 
 # ------------------------------------------------------------------ normalisation
 
-_NORMALIZER_SETTINGS = ("norm_obs", "norm_reward", "clip_obs", "clip_reward", "gamma", "epsilon", "norm_obs_keys")
+_Positive = Annotated[float, msgspec.Meta(gt=0)]
+_NORMALIZER_SETTINGS: dict[str, Any] = {
+    **dict.fromkeys(("norm_obs", "norm_reward"), bool),
+    **dict.fromkeys(("clip_obs", "clip_reward", "epsilon"), _Positive),
+    "gamma": Annotated[float, msgspec.Meta(gt=0, le=1)],
+    "norm_obs_keys": list[str] | None,
+}
 
 
 def _normalizer_tree(env: VecNormalize) -> dict[str, Any]:
@@ -391,10 +411,8 @@ def _normalized(env: Any, saved: _Normalizer) -> VecEnv:
     settings = {name: from_plain(value) for name, value in saved.settings.items()}
     if set(settings) != set(_NORMALIZER_SETTINGS):
         raise ValueError(f"model.normalizer: settings {sorted(settings)} given; accepted are {sorted(_NORMALIZER_SETTINGS)}")
-    for name in ("clip_obs", "clip_reward", "gamma", "epsilon"):
-        convert(settings[name], float, f"model.normalizer.{name}")
-        if not 0 < settings[name] < np.inf:
-            raise ValueError(f"model.normalizer.{name}: {settings[name]} given; accepted are positive numbers")
+    for name, kind in _NORMALIZER_SETTINGS.items():
+        convert(settings[name], kind, f"model.normalizer.{name}")
     if unwrap_vec_normalize(env) is not None:  # there may be wrappers around it
         return env
     try:

@@ -62,9 +62,10 @@ def check_noise(noise: Any, n_envs: int, size: int) -> None:
     try:
         with preserved_rng():
             tried = copy.deepcopy(noise)
+            drawn = [np.asarray(tried(), dtype=np.float64)]
             tried.reset()
-            drawn = np.asarray(tried(), dtype=np.float64)
+            drawn.append(np.asarray(tried(), dtype=np.float64))
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError) as error:
         raise ValueError(f"noise: it draws nothing: {error!r}") from None
-    if drawn.size not in (size, size * n_envs) or not np.isfinite(drawn).all():
+    if any(each.size not in (size, size * n_envs) or not np.isfinite(each).all() for each in drawn):
         raise ValueError(f"noise: what it draws is no noise for {n_envs} actions")

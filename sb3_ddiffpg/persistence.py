@@ -12,10 +12,11 @@ from msgspec import Meta
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ddiffpg.checkpoints import InterruptedRun, read_checkpoint
 from sb3_ddiffpg.interrupts import handlers_restored
-from sb3_ddiffpg.model_file import KIND, Built, build_model, model_tree, sized_as
+from sb3_ddiffpg.model_file import KIND, Built, ModelTree, build_model, model_tree, sized_as
 from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
 from sb3_ddiffpg.safe_files import Count, convert, read, write
 from sb3_ddiffpg.visits import VisitMap
@@ -227,6 +228,9 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         if env is None:
             raise ValueError("env=None given; accepted are the environments to go on in, made as the run's")
         _, checkpoint = read_checkpoint(path)
+        n_envs, n_given = convert(checkpoint.model, ModelTree, "model").n_envs, env.num_envs if isinstance(env, VecEnv) else 1
+        if n_given != n_envs:
+            raise ValueError(f"env: {n_given} environments given; accepted are {n_envs}, as many as the run has")
         model = build_model(cls, checkpoint.model, env, device, custom_objects, **kwargs)
         model._interrupted = InterruptedRun(checkpoint.run)
         try:

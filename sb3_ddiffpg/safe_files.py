@@ -30,6 +30,7 @@ _ARRAY = "$array"
 _LONGEST = 2**24
 # Deeper than anything that we write, and shallow enough for every reader
 _DEEPEST = 50
+_LONGEST_MESSAGE = 500
 
 
 class DamagedError(ValueError):
@@ -92,8 +93,8 @@ def read(path: Path, kind: str) -> Any:
                 raise ValueError(f"{path} is of version {metadata.get('version')!r}; this {FORMAT} reads version {VERSION}")
             if metadata.get("kind") != kind:
                 raise ValueError(f"{path} holds a {metadata.get('kind')!r}, not a {kind!r}")
-            arrays = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, TypeError, KeyError, AttributeError) as error:  # NumPy has fewer types
+            arrays = _arrays(file, path)
+    except SafetensorError as error:
         raise DamagedError(f"{path} is damaged, or no file of {FORMAT}: {error}") from None
     text = metadata.get("tree", "")
     if len(text) > _LONGEST:
@@ -101,12 +102,25 @@ def read(path: Path, kind: str) -> Any:
     if metadata.get("sha256") != _digest(kind, text, arrays):
         raise DamagedError(f"{path} is damaged: its contents do not fit their checksum")
     try:
-        tree = _unpack(json.loads(text), arrays, "")
+        tree = _unpack(json.loads(text), arrays, [])
         if arrays:
             raise ValueError(f"{sorted(arrays)[:3]} have no place in it")
         return tree
     except (ValueError, RecursionError, KeyError) as error:
-        raise DamagedError(f"{path} is damaged: {error}") from None
+        raise DamagedError(f"{path} is damaged: {_short(error)}") from None
+
+
+def _arrays(file: Any, path: Path) -> dict[str, np.ndarray]:
+    try:
+        return {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, TypeError, ValueError, KeyError, AttributeError) as error:  # NumPy has fewer types and sizes
+        raise DamagedError(f"{path} is damaged, or no file of {FORMAT}: {_short(error)}") from None
+
+
+def _short(error: Exception) -> str:
+    """A file's own words may be long."""
+    text = str(error)
+    return text if len(text) <= _LONGEST_MESSAGE else f"{text[:_LONGEST_MESSAGE]}..."
 
 
 def remove_unfinished(folder: Path, names: str) -> None:
@@ -142,8 +156,8 @@ def convert(tree: Any, schema: Any, what: str) -> Any:
     """
     try:
         return msgspec.convert(tree, schema)
-    except (msgspec.ValidationError, RecursionError) as error:
-        raise ValueError(f"{what}: {error}") from None
+    except (msgspec.ValidationError, UnicodeError, RecursionError) as error:
+        raise ValueError(f"{what}: {_short(error)}") from None
     except AttributeError as error:  # an array where a mapping belongs
         raise ValueError(f"{what}: Expected `object`: {error}") from None
 
@@ -187,19 +201,25 @@ def _pack(tree: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
     raise TypeError(f"{place}: {tree!r} of {type(tree)} cannot be saved")
 
 
-def _unpack(packed: Any, arrays: dict[str, np.ndarray], place: str, depth: int = 0) -> Any:
-    """The tree of what JSON held; each array is taken out of ``arrays`` at its place, or a small file would hold many."""
-    if depth > _DEEPEST:
+def _unpack(packed: Any, arrays: dict[str, np.ndarray], path: list[str]) -> Any:
+    """
+    The tree of what JSON held at a path; each array is taken out of ``arrays`` at its place, or a small file would hold many.
+    """
+    if len(path) > _DEEPEST:
         raise ValueError(f"more than {_DEEPEST} lists and dicts in one another")
-    if isinstance(packed, list):
-        return [_unpack(each, arrays, f"{place}/{i}", depth + 1) for i, each in enumerate(packed)]
-    if isinstance(packed, dict):
-        if set(packed) == {_ARRAY}:
-            if packed[_ARRAY] != place:
-                raise ValueError(f"an array of another place at {place[:100]!r}")
-            return arrays.pop(place)
-        return {key: _unpack(each, arrays, f"{place}/{_name(key)}", depth + 1) for key, each in packed.items()}
-    return packed
+    if not isinstance(packed, (list, dict)):
+        return packed
+    if isinstance(packed, dict) and set(packed) == {_ARRAY}:
+        place = "".join(f"/{_name(key)}" for key in path)
+        if packed[_ARRAY] != place:
+            raise ValueError(f"an array of another place at {place[:100]!r}")
+        return arrays.pop(place)
+    tree = []
+    for key, each in packed.items() if isinstance(packed, dict) else enumerate(packed):
+        path.append(str(key))
+        tree.append((key, _unpack(each, arrays, path)))
+        path.pop()
+    return dict(tree) if isinstance(packed, dict) else [each for _, each in tree]
 
 
 def _name(key: str) -> str:

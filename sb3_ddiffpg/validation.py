@@ -9,6 +9,7 @@ from torch import nn
 from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.clustering import LINKAGES
 from sb3_ddiffpg.critics import TWIN_TARGETS
+from sb3_ddiffpg.divergence import LARGEST
 from sb3_ddiffpg.intrinsic import NOVELTY_MEASURES
 from sb3_ddiffpg.target_actions import ACTION_OPTIMIZERS
 
@@ -17,19 +18,34 @@ CONTROLS = ("shuffled_embeddings", "random_clusters")
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and not np.isnan(value)
+    return _is_integer(value) or (isinstance(value, (float, np.floating)) and not np.isnan(value))
 
 
 def _is_integer(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and abs(int(value)) < 2**63
 
 
 def _is_share(value: Any) -> bool:
     return _is_number(value) and 0 <= value <= 1
 
 
-def _is_rate(value: Any) -> bool:
-    return callable(value) or (_is_number(value) and 0 <= value < np.inf)
+def _is_moderate(value: Any) -> bool:
+    return _is_number(value) and abs(value) < LARGEST
+
+
+def _or_schedule(is_right: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    """The value itself, or a function of the remaining progress with such values."""
+
+    def check(value: Any) -> bool:
+        if not callable(value):
+            return is_right(value)
+        return all(is_right(float(value(progress))) for progress in (1.0, 0.5, 0.0))
+
+    return check
+
+
+# Beyond 1000 a parameter may become infinite in one step
+_is_rate = _or_schedule(lambda value: _is_number(value) and 0 <= value <= 1000)
 
 
 def _is_frequency(value: Any) -> bool:
@@ -73,8 +89,8 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     ),
     (
         ("exploration_v_max",),
-        "be positive and finite, or None",
-        lambda value: value is None or (_is_number(value) and 0 < value < np.inf),
+        f"be positive and below {LARGEST:g}, or None",
+        lambda value: value is None or (_is_moderate(value) and value > 0),
     ),
     (
         (
@@ -85,18 +101,22 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
         "be a finite number of at least 0",
         lambda value: _is_number(value) and 0 <= value < np.inf,
     ),
-    (("v_min", "v_max"), "be a finite number", lambda value: _is_number(value) and np.isfinite(value)),
-    (("learning_rate",), "be a number of at least 0 or a schedule", _is_rate),
-    (("qf_learning_rate",), "be a number of at least 0, a schedule or None", lambda value: value is None or _is_rate(value)),
+    (("v_min", "v_max"), f"be a number between -{LARGEST:g} and {LARGEST:g}", _is_moderate),
+    (("learning_rate",), "lie in [0, 1000], or be a schedule of such numbers", _is_rate),
+    (
+        ("qf_learning_rate",),
+        "lie in [0, 1000], be a schedule of such numbers or None",
+        lambda value: value is None or _is_rate(value),
+    ),
     (
         ("latent_coef",),
-        "be a finite number of at least 0 or a schedule",
-        lambda value: callable(value) or (_is_number(value) and 0 <= value < np.inf),
+        "be a finite number of at least 0 or a schedule of such",
+        _or_schedule(lambda value: _is_number(value) and 0 <= value < np.inf),
     ),
     (
         ("exploration_share",),
-        "lie in [0, 1], be a schedule or None",
-        lambda value: value is None or callable(value) or _is_share(value),
+        "lie in [0, 1], be a schedule of such numbers or None",
+        lambda value: value is None or _or_schedule(_is_share)(value),
     ),
     (
         ("target_entropy",),
@@ -138,8 +158,16 @@ def check_arguments(model: Any, policy_arguments: Callable[[], dict[str, Any]]) 
     """
     for names, accepted, is_right in RANGES:
         for name in names:
-            if hasattr(model, name) and not is_right(getattr(model, name)):
-                raise ValueError(f"{name} must {accepted}, got {getattr(model, name)!r}")
+            if not hasattr(model, name):
+                continue
+            value = getattr(model, name)
+            try:
+                right, problem = is_right(value), None
+            except Exception as error:  # of a schedule
+                right, problem = False, error
+            if not right:
+                why = "" if problem is None else f": {problem!r}"
+                raise ValueError(f"{name} must {accepted}, got {value!r}{why}") from problem
     if model.optimize_memory_usage:
         raise ValueError("optimize_memory_usage=True is not supported: trajectories do not lie in one ring")
     given = model.replay_buffer_class

@@ -12,6 +12,7 @@ from environments import SMALL, AnySpaces, BreaksAt, TwoEnds, assert_no_gaps, as
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 
 from sb3_ddiffpg import ClusteringCallback, DDiffPG
@@ -67,6 +68,10 @@ BAD_ARGUMENTS = [
     ("optimize_memory_usage", True),
     ("replay_buffer_class", ReplayBuffer),
     ("replay_buffer_class", "ModeReplayBuffer"),
+    *((name, 1e39) for name in ("v_max", "exploration_v_max", "learning_rate")),
+    *(("gamma", value) for value in (10**400, -(10**400))),
+    *(("exploration_share", share) for share in (lambda progress: np.nan, lambda progress: 2 * progress, dict, "lin_0.5")),
+    *(("learning_rate", rate) for rate in (lambda progress: 1 / progress, LinearSchedule(1e-3, -1e-3, 0.5), "3e-4")),
     *(("train_freq", value) for value in ((1, "minute"), (1,), (0, "episode"), 1.5, 0, -3, True)),
     *(("mode_features", value) for value in ([2], [-1], [], [[0]], [0.5], "position", 0, lambda obs: obs.sum())),
 ]
@@ -122,6 +127,13 @@ def test_mode_features_of_dict_observations():
         small_model(env, "MultiInputPolicy", mode_features="c")
     with pytest.raises(ValueError, match="mode_features must be a key or a callable for dict observations, got indices"):
         small_model(env, "MultiInputPolicy", mode_features=[0])
+
+
+def test_an_action_that_has_no_range():
+    """It was not a number once the warm-up was over."""
+    still = spaces.Box(np.array([-1.0, 0.5], np.float32), np.array([1.0, 0.5], np.float32))
+    with pytest.raises(ValueError, match=r"action_space: low is not below high in components \[1\]; accepted are ranges"):
+        small_model(AnySpaces(action_space=still))
 
 
 def test_what_is_given_at_loading_is_checked_too(trained, tmp_path):
@@ -240,8 +252,8 @@ def test_optimizer_arguments_that_exclude_the_fused_one():
 
 def test_a_diverged_policy_does_not_step_the_environments():
     """``BreaksAt`` refuses an action of NaN, as a simulator would crash of it."""
-    model = small_model(breaking("observation", 10**9), learning_rate=1e6)
-    with pytest.raises(DivergedError, match="the loss of the exploratory critics is"):
+    model = small_model(breaking("observation", 10**9), learning_rate=1e3)
+    with pytest.raises(DivergedError, match="Training has diverged: the loss of the"):
         model.learn(1000)
     with th.no_grad():
         next(model.actor.diffusion.parameters()).fill_(np.nan)

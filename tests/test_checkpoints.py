@@ -1,12 +1,14 @@
 """A run that was killed goes on from its last checkpoint, and nothing tells it from one that was not."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from filelock import FileLock
 from rl_zoo3 import gym_patches
 from stable_baselines3.common.callbacks import (
     BaseCallback,
+    ConvertCallback,
     EvalCallback,
     EveryNTimesteps,
     StopTrainingOnMaxEpisodes,
@@ -292,6 +295,56 @@ def test_a_second_learn_goes_on_where_it_was(tmp_path):
     assert outcome(resumed) == outcome(whole)
     resumed.learn(50, reset_num_timesteps=False)  # a call like any other
     assert 350 <= resumed.num_timesteps < 400
+
+
+def test_a_copy_of_ones_own_is_not_the_newest(tmp_path):
+    """Letters come after digits: a copy was taken for the newest, and the run went on behind it for ever."""
+    callback = RunCheckpointCallback(tmp_path, save_freq=100)
+    model_for(known_ends()).learn(200, callback=callback)
+    copy = shutil.copy(checkpoint_files(tmp_path)[-1], tmp_path / "checkpoint_backup.safetensors")
+    newest = checkpoint_files(tmp_path)[0]
+    resumed = silent(DDiffPG.resume(tmp_path, known_ends()))
+    assert newest.stem == f"checkpoint_{resumed.num_timesteps:012d}"
+    resumed.learn(400, callback=RunCheckpointCallback(tmp_path, save_freq=100))
+    assert Path(copy).exists() and checkpoint_files(tmp_path)[0] > newest
+    with pytest.raises(ValueError, match="holds a checkpoint that is further than step"):
+        silent(DDiffPG.resume(copy, known_ends())).learn(400, callback=RunCheckpointCallback(tmp_path))
+
+
+def test_as_many_environments_as_the_run_had(tmp_path):
+    model_for(known_ends()).learn(40, callback=RunCheckpointCallback(tmp_path))
+    with pytest.raises(ValueError, match="env: 3 environments given; accepted are 4, as many as the run has"):
+        DDiffPG.resume(tmp_path, known_ends(3))
+
+
+def test_callbacks_that_hold_functions(tmp_path):
+    called = []
+    others = ConvertCallback(lambda local, all_: called.append(1) or True)
+    model_for(known_ends()).learn(100, callback=[RunCheckpointCallback(tmp_path), others])
+    assert called and checkpoint_files(tmp_path)
+
+
+def test_rewards_of_a_long_episode_are_many(tmp_path, monkeypatch):
+    """As plain values they would come to what a file may hold of those."""
+
+    class Forever(KnownEnds):
+        def step(self, action):
+            observation, *_, info = super().step(action)
+            self.x, self.steps = 0.0, 0
+            return observation, float(self.np_random.uniform()), False, False, info
+
+    def make_env():
+        return DummyVecEnv([lambda: Monitor(Forever())] * 4)
+
+    env = make_env().envs[0]
+    env.reset(seed=0)
+    env.rewards = [0.1, 0.2]
+    state = env_snapshot(env)
+    state["layers"][0]["values"]["rewards"] = [0.3, 0.4, 0.5]  # as older files have them
+    restore_env(env, state)
+    assert env.rewards == [0.3, 0.4, 0.5]
+    monkeypatch.setattr("sb3_ddiffpg.safe_files._LONGEST", 30_000)
+    assert_goes_on_the_same(make_env, tmp_path, end=12_000, at=[6], learning_starts=20_000, train_freq=100, buffer_size=15_000)
 
 
 def test_only_the_newest_stay(tmp_path):
@@ -633,6 +686,8 @@ def test_runs_that_contradict_themselves_are_refused(tmp_path):
         (lambda run: run["noise"]["state"].pop("low"), "noise: it draws nothing"),
         (lambda run: run["noise"]["state"].update(shape={"tuple": [10**12, 1]}), "noise: of another shape"),
         (lambda run: run["noise"]["state"].update(high=float("nan")), "noise: "),
+        (lambda run: run["noise"]["state"]["sigma"].fill(np.nan), "noise: what it draws"),
+        (lambda run: run["buffer"].update(mode_rows=[np.zeros(0, np.int32)] * 20_000), "of 20000 modes, the model has"),
         (lambda run: run["episodes"].update(groups=np.zeros(7, dtype=np.int64)), "behavior"),
         (lambda run: run.update(last_obs=np.zeros((4, 3), dtype=np.float32)), "last_obs"),
         (lambda run: run.update(last_obs=np.full((4, 2), np.nan, dtype=np.float32)), "last_obs"),

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import re
 import resource
 import subprocess
 import sys
@@ -34,10 +35,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES
+from sb3_ddiffpg.checkpoints import RunCheckpointCallback
 from sb3_ddiffpg.model_file import build_model, model_tree
 from sb3_ddiffpg.plain_values import from_plain, to_plain
 from sb3_ddiffpg.policies import DiffusionPolicy
-from sb3_ddiffpg.safe_files import _digest, convert, read, remove_unfinished, write
+from sb3_ddiffpg.safe_files import DamagedError, _digest, convert, read, remove_unfinished, write
 from sb3_ddiffpg.schedules import LateLinearSchedule
 
 PLAIN = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
@@ -103,6 +105,39 @@ def test_numbers_that_numpy_does_not_have(tmp_path, dtype):
     (tmp_path / "file").write_bytes(len(header).to_bytes(8, "little") + header + bytes(size))
     with pytest.raises(ValueError, match="is damaged"):
         read(tmp_path / "file", "thing")
+
+
+def written(path, text, arrays=None, **tensors):
+    """A file as a stranger may write it: any text for its plain values, any tensors in the header."""
+    digest = _digest("model", text, arrays or {})
+    metadata = {"format": "sb3_ddiffpg", "version": "1", "kind": "model", "tree": text, "sha256": digest}
+    header = json.dumps({"__metadata__": metadata, **tensors}).encode()
+    path.write_bytes(len(header).to_bytes(8, "little") + header)
+    return path
+
+
+def test_a_long_key_above_a_long_list_costs_no_more_than_both(tmp_path, monkeypatch):
+    """A place was spelt for each entry: hours for a file of a few megabytes."""
+    spelt = []
+    monkeypatch.setattr("sb3_ddiffpg.safe_files._name", lambda key: spelt.append(key) or key)
+    read(written(tmp_path / "file", json.dumps({"x" * 1000: [0] * 1000})), "model")
+    assert len(spelt) <= 1
+    with pytest.raises(ValueError, match="model: Object contains unknown field") as raised:
+        DDiffPG.load(tmp_path / "file", safe=True)
+    assert len(str(raised.value)) < 600
+
+
+@pytest.mark.parametrize("shape", [[0, 2**62], [0] * 65], ids=["large", "many"])
+def test_shapes_that_numpy_does_not_have(tmp_path, shape):
+    path = written(tmp_path / "file", "{}", **{"/0": {"dtype": "F32", "shape": shape, "data_offsets": [0, 0]}})
+    with pytest.raises(DamagedError, match=re.escape(str(path))):
+        read(path, "model")
+
+
+def test_half_of_a_character(tmp_path):
+    path = written(tmp_path / "file", r'{"\ud800": 1}')
+    with pytest.raises(ValueError, match="model: .*surrogates not allowed"):
+        DDiffPG.load(path, safe=True)
 
 
 def test_many_write_one_file(tmp_path):
@@ -228,6 +263,44 @@ def test_spaces(space, tmp_path):
         DDiffPG.load(tmp_path / "model", env=DummyVecEnv([lambda: AnySpaces(spaces.Box(-5, 5, (9,)))]), safe=True)
 
 
+@pytest.mark.parametrize("name", ["ddiffpg", *BASELINES])
+def test_parts_of_an_observation_keep_their_order(tmp_path, name):
+    """Gymnasium sorts them where they come in a dict; the networks were made for the order that there was."""
+    algorithm = DDiffPG if name == "ddiffpg" else BASELINES[name]
+    box = spaces.Box(-1.0, 1.0, (2,))
+    space = spaces.Dict([("observation", box), ("achieved_goal", box), ("desired_goal", box)])
+    env = DummyVecEnv([lambda: AnySpaces(space)] * 2)
+    model = algorithm("MultiInputPolicy", env, learning_starts=10, buffer_size=500, policy_kwargs={"net_arch": [8]}, seed=0)
+    model.learn(40, callback=RunCheckpointCallback(tmp_path / "run"))
+    model.export(tmp_path / "model")
+    observations = {key: np.random.default_rng(i).uniform(-1, 1, (3, 2)) for i, key in enumerate(space.spaces)}
+    expected = model.predict(observations, deterministic=True)[0]
+    for loaded in (
+        algorithm.load(tmp_path / "model", safe=True),
+        algorithm.load(tmp_path / "model", env=env, safe=True),
+        algorithm.resume(tmp_path / "run", env),
+    ):
+        assert list(loaded.observation_space.spaces) == ["observation", "achieved_goal", "desired_goal"]
+        np.testing.assert_array_equal(loaded.predict(observations, deterministic=True)[0], expected)
+
+
+def test_statistics_that_no_observations_have(tmp_path):
+    model = small_model(VecNormalize(DummyVecEnv([TwoEnds] * 2), norm_reward=False)).learn(40)
+    env = DummyVecEnv([TwoEnds] * 2)
+    for place, value, said in (
+        (("statistics", "observations", "", "count"), float("inf"), "numbers that no observations have"),
+        (("statistics", "observations", "", "var"), np.full(2, np.inf), "numbers that no observations have"),
+        (("statistics", "observations", "", "mean"), np.full(2, 1e308), "numbers that no observations have"),
+        (("settings", "gamma"), 5.0, "gamma"),
+        (("settings", "epsilon"), float("nan"), "epsilon"),
+        (("settings", "norm_obs"), "x", "norm_obs"),
+    ):
+        tree = copied(model_tree(model))
+        _set(tree, ("normalizer", *place), value)
+        with pytest.raises(ValueError, match=said):
+            build_model(DDiffPG, tree, env)
+
+
 def test_normalised_observations(tmp_path):
     env = VecNormalize(DummyVecEnv([TwoEnds] * 2), norm_reward=False, clip_obs=7.0)
     model = small_model(env)
@@ -349,7 +422,10 @@ def test_records_that_no_training_makes_are_refused(trained):
         ((*of_optimizer, "state", "77"), {}, "none of its"),
         ((*of_optimizer, "groups", 0, "amsgrad"), True, "gathered"),
         ((*of_optimizer, "groups", 0, "differentiable"), True, "optimizer"),
-        ((*of_optimizer, "groups", 0, "eps"), float("nan"), "finite"),
+        ((*of_optimizer, "groups", 0, "eps"), float("nan"), "accepted are numbers"),
+        ((*of_optimizer, "groups", 0, "eps"), 10**400, "accepted are numbers"),
+        ((*of_optimizer, "groups", 0, "weight_decay"), 1e300, "accepted are numbers"),
+        (("arguments", "exploration_share"), {"class": "torch.optim.Adam"}, "exploration_share"),
         ((*of_optimizer, "groups", 0, "weight_decay"), -1.0, "weight_decay"),
         ((*of_optimizer, "groups", 0, "betas"), {"tuple": [1.0, 1.0]}, "beta"),
         ((*of_optimizer, "groups", 0, "betas"), {"tuple": ["x", "y"]}, "optimizer"),
@@ -499,6 +575,11 @@ def test_normalisation_below_another_wrapper_is_found(tmp_path):
         (("observation_space",), {"kind": "Discrete", "n": [10**9, 0]}, "accepted is .*1000000005"),
         (("observation_space",), {"kind": "MultiDiscrete", "n": [10**8, 10**8]}, "accepted is .*200000005"),
         (("observation_space",), {"kind": "MultiBinary", "shape": [2**24]}, "accepted is .*16777221"),
+        (("observation_space", "dtype"), "f4,(1 1)f4", "space: bounds of shapes .*f4"),
+        (("policy",), "LstmPolicy", "'LstmPolicy' given; accepted are"),
+        (("arguments", "replay_buffer_kwargs"), {"dict": {"n_path_points": 10**9}}, "n_path_points: 1000000000 given"),
+        (("arguments", "train_freq"), {"tuple": [0, "step"]}, "train_freq must be"),
+        (("arguments", "gamma"), 2**70, "gamma must lie"),
         (("arguments", "n_action_gradient_steps"), 10**9, "n_action_gradient_steps: 1000000000 given"),
         (("arguments", "batch_size"), 10**12, "batch_size: 1000000000000 given"),
         (("arguments", "policy_kwargs"), {"dict": {"net_arch": [1] * 30_000}}, "30000 layers for a file of"),

@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
+from sb3_ddiffpg.divergence import LARGEST
 from sb3_ddiffpg.safe_files import Count, check_array, convert
 
 
@@ -86,7 +87,8 @@ def restore_env(env: gym.Env, tree: Any) -> None:
         raise ValueError(f"environment: saved of another than {type(core).__name__}")
     for wrapper, values in layers:
         for name, value in values.items():
-            setattr(wrapper, name, convert(value, _GYM_WRAPPERS[_plain(type(wrapper))][name], f"environment.{name}"))
+            numbers = check_array(value, np.float64, [None], name).tolist() if isinstance(value, np.ndarray) else value
+            setattr(wrapper, name, convert(numbers, _GYM_WRAPPERS[_plain(type(wrapper))][name], f"environment.{name}"))
         if isinstance(wrapper, wrappers.PassiveEnvChecker):  # it checks first calls, which others were
             wrapper.checked_reset = wrapper.checked_step = wrapper.checked_data_reuse = True
     try:
@@ -158,7 +160,10 @@ def _peel(env: Any, wrapper: type, inner: str, known: dict[type, dict[str, Any]]
         kind = _plain(type(env))
         if kind not in known:
             return None
-        layers.append({"kind": kind.__name__, "values": {name: getattr(env, name) for name in known[kind]}})
+        values = {name: getattr(env, name) for name in known[kind]}
+        # A file holds many numbers only as arrays
+        values = {name: np.array(each, dtype=np.float64) if isinstance(each, list) else each for name, each in values.items()}
+        layers.append({"kind": kind.__name__, "values": values})
         env = getattr(env, inner)
     return layers, env
 
@@ -200,7 +205,9 @@ def restore_normalization(env: VecNormalize, tree: Any) -> None:
     for target, saved in pairs:
         for name in ("mean", "var"):
             check_array(getattr(saved, name), np.float64, np.shape(getattr(target, name)), f"normalization.{name}")
-        if not (np.isfinite(saved.mean).all() and (saved.var >= 0).all() and saved.count >= 0):
+        if not ((np.abs(saved.mean) < LARGEST).all() and (0 <= saved.var).all() and (saved.var < LARGEST**2).all()):
+            raise ValueError("normalization: there are numbers that no observations have")
+        if not 0 <= saved.count < 2**53:
             raise ValueError("normalization: there are numbers that no observations have")
     for target, saved in pairs:
         target.mean, target.var, target.count = saved.mean.copy(), saved.var.copy(), saved.count
