@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 from sb3_ddiffpg.checkpoints import nested_callbacks
 from sb3_ddiffpg.episodes import run_episodes
 from sb3_ddiffpg.evaluation import evaluate_modes
+from sb3_ddiffpg.full_disk import missed_if_full
 from sb3_ddiffpg.history import ModeEvent
 from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 from sb3_ddiffpg.rng import preserved_rng
@@ -95,8 +96,10 @@ class ModeEvalCallback(EvalCallback):
 
     def _on_step(self) -> bool:
         self._labels = set()
-        with preserved_rng():
-            return super()._on_step()
+        goes_on = True
+        with preserved_rng(), missed_if_full("What the evaluation found"):
+            goes_on = super()._on_step()
+        return goes_on
 
 
 class _PeriodicCallback(BaseCallback):
@@ -234,8 +237,12 @@ class EvaluateModesCallback(_PeriodicCallback):
             self.logger.record(f"eval_modes/{name}", value)
         self.logger.dump(self.num_timesteps)
         if self.path is not None:
-            with self.path.open("a") as file:
+            with missed_if_full("What the evaluation found"), self.path.open("a") as file:
                 file.write(self._line(self.num_timesteps, found))
+        with missed_if_full("The best model"):
+            self._keep_if_best(found)
+
+    def _keep_if_best(self, found: ModeEvaluation) -> None:
         # Of equals the later one has seen more
         reached = score(found)
         if self.best_model_path is not None and reached >= self._best:

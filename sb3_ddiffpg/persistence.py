@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorD
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ddiffpg.checkpoints import InterruptedRun, read_checkpoint
+from sb3_ddiffpg.full_disk import missed_if_full
 from sb3_ddiffpg.interrupts import handlers_restored
 from sb3_ddiffpg.model_file import KIND, Built, ModelTree, build_model, model_tree, sized_as
 from sb3_ddiffpg.plain_values import NeededError, from_plain, to_plain
@@ -89,6 +90,11 @@ class SavableAlgorithm(OffPolicyAlgorithm):
             super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         self._interrupted = None  # there may have been no step left to do
         return self
+
+    def dump_logs(self) -> None:
+        """See SB3; a full disk does not end the training."""
+        with missed_if_full("Logs"):
+            super().dump_logs()
 
     def save(
         self,

@@ -1,11 +1,17 @@
 """The RL zoo's commands with DDiffPG: training, resuming, watching, filming, optimising."""
 
 import argparse
+import errno
 import inspect
+import os
 import re
 import runpy
 import shutil
+import signal
+import subprocess
 import sys
+import time
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,12 +23,15 @@ import pytest
 import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.utils import ALGOS
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecMonitor
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn, optim
 
 from sb3_ddiffpg import DDiffPG, zoo
 from sb3_ddiffpg.baselines import BASELINES
+from sb3_ddiffpg.checkpoints import checkpoint_files
 from sb3_ddiffpg.envs import PointMazeVecEnv
 from sb3_ddiffpg.zoo import ModeExperimentManager, check_hyperparameters, main, search
 from sb3_ddiffpg.zoo.settings import ZOO_KEYS
@@ -127,6 +136,46 @@ def test_a_killed_training_goes_on(tmp_path, monkeypatch):
         main(command("nothing", "--resume"))
     with pytest.raises(SystemExit, match="accepted is the folder of a run"):
         main(command("nothing", "--resume", str(tmp_path)))
+
+
+@pytest.mark.parametrize("changes", [{}, {"env_wrapper": "gymnasium.wrappers.FlattenObservation"}], ids=["ours", "wrapped"])
+def test_a_full_disk_does_not_end_a_training(tmp_path, monkeypatch, changes):
+    """The monitor's file, logs, what an evaluation found: the run goes on without, and keeps its checkpoints."""
+    full = OSError(errno.ENOSPC, "No space left on device")
+
+    def fails(*args, **kwargs):
+        raise full
+
+    for place in (Logger, "dump"), (np, "savez"), (ResultsWriter, "write_row"), (ResultsWriter, "close"):
+        monkeypatch.setattr(*place, fails)
+    command = ["train", "--env", ENV, "-n", "300", "--n-envs", "4", "-f", str(tmp_path), "--log-interval", "1", *ENV_KWARGS]
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        main([*command, *hyperparams(**changes), "--eval-freq", "40", "--checkpoint-freq", "100"])
+    run = tmp_path / "ddiffpg" / f"{ENV}_1"
+    assert DDiffPG.load(run / f"{ENV}.zip").num_timesteps == 300 and len(list((run / "checkpoints").glob("*_*"))) == 2
+    missed = {str(each.message).split(" cannot be written")[0] for each in said if "No space left" in str(each.message)}
+    assert missed == {"Logs", "What the evaluation found", "What the monitor notes"}
+    full.errno = errno.EACCES
+    with pytest.raises(OSError, match="No space left"):  # of another number now
+        main([*command, *hyperparams(**changes), "--eval-freq", "-1"])
+
+
+def test_workers_of_the_zoo_survive_an_interrupt(tmp_path):
+    """In a terminal it reaches all processes; SB3's own workers would end, and the run with them."""
+    command = [sys.executable, "train.py", "--env", ENV, "-n", "1000000", "--n-envs", "3", "--vec-env", "subproc"]
+    command += ["-f", str(tmp_path), "--eval-freq", "-1", *hyperparams(learning_starts=10**6)]
+    root = Path(__file__).parent.parent
+    process = subprocess.Popen(command, cwd=root, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    run = tmp_path / "ddiffpg" / f"{ENV}_1"
+    while not list(run.glob("checkpoints/checkpoint_*")):
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.1)
+    time.sleep(1)
+    os.killpg(process.pid, signal.SIGINT)
+    assert b"SIGINT: training ends with a checkpoint after this step" in process.communicate(timeout=60)[0]
+    assert process.returncode == 0
+    assert checkpoint_files(run / "checkpoints")[0].stem > "checkpoint_000000000000" and (run / f"{ENV}.zip").exists()
 
 
 def test_resuming_refuses_unknown_keys(run, tmp_path):

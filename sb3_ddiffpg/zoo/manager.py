@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,19 @@ from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.checkpoints import RunCheckpointCallback
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.envs.turns import TurnVecEnv
+from sb3_ddiffpg.envs.workers import WorkerVecEnv
+from sb3_ddiffpg.full_disk import spared_monitor
 from sb3_ddiffpg.schedules import LateLinearSchedule
 from sb3_ddiffpg.zoo.settings import ALGO, ALGOS, check_hyperparameters
 
 # How a learning rate may be given: 3e-4, `lin_3e-4`, `late_3e-4`
 SCHEDULES: dict[str, Callable[[float], Any]] = {"": float, "lin": SimpleLinearSchedule, "late": LateLinearSchedule}
+
+
+def _spared(wrapper: Callable[[Any], Any] | None, env: Any) -> Any:
+    """The zoo's wrapper around SB3's monitor, which a full disk does not end."""
+    spared_monitor(env)
+    return env if wrapper is None else wrapper(env)
 
 
 class ModeExperimentManager(ExperimentManager):
@@ -33,8 +42,9 @@ class ModeExperimentManager(ExperimentManager):
         self.is_own = self.algo == ALGO or self.algo in BASELINES
         if self.is_own:
             self.deterministic_eval = False
-        if self.vec_env_class is DummyVecEnv:
-            self.vec_env_class = TurnVecEnv  # which says where an error was raised
+        # They say where an error was raised, and Ctrl-C does not end the workers
+        better: dict[Any, Any] = {DummyVecEnv: TurnVecEnv, SubprocVecEnv: WorkerVecEnv}
+        self.vec_env_class = better.get(self.vec_env_class, self.vec_env_class)
         if resume is not None:
             self.continue_training = True  # with what ``_load_pretrained_agent`` gives
             self.save_path = str(resume)
@@ -89,8 +99,13 @@ class ModeExperimentManager(ExperimentManager):
         """
         env_id = self.env_name.gym_id
         wrapped = self.env_wrapper is not None or self.frame_stack is not None
-        if not is_ours(env_id) or wrapped or self.vec_env_class is SubprocVecEnv:
-            return super().create_envs(n_envs, eval_env, no_log)
+        if not is_ours(env_id) or wrapped or self.vec_env_class is WorkerVecEnv:
+            wrapper = self.env_wrapper
+            self.env_wrapper = partial(_spared, wrapper)
+            try:
+                return super().create_envs(n_envs, eval_env, no_log)
+            finally:
+                self.env_wrapper = wrapper
         env_kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
         # A run that goes on must not lose what it has noted
         n_before = len(list(Path(self.save_path).glob("*.monitor.csv")))
@@ -98,7 +113,7 @@ class ModeExperimentManager(ExperimentManager):
         env = make_vec_env(env_id, n_envs, seed=self.seed, **env_kwargs)
         if isinstance(env, VecMonitor):  # it writes no file
             env = env.venv
-        env = VecMonitor(env, monitor_file, **{"info_keywords": ("is_success",), **self.monitor_kwargs})
+        env = spared_monitor(VecMonitor(env, monitor_file, **{"info_keywords": ("is_success",), **self.monitor_kwargs}))
         if self.vec_env_wrapper is not None:
             env = self.vec_env_wrapper(env)
         return self._maybe_normalize(env, eval_env)
