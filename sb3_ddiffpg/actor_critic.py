@@ -243,6 +243,9 @@ class NoveltyActorCritic(SavableAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_arguments()
+        for name in ("learning_rate", "qf_learning_rate"):
+            if isinstance(rate := getattr(self, name), np.number):
+                setattr(self, name, float(rate))  # SB3 wants Python's
         if self.replay_buffer_class is None:
             self.replay_buffer_class = self.default_replay_buffer_class
         self._resolve_mode_features()

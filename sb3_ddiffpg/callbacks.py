@@ -37,8 +37,8 @@ class ClusteringCallback(BaseCallback):
 
     def __init__(self, recluster_freq: int | None = None, verbose: int | None = None) -> None:
         super().__init__(0 if verbose is None else verbose)
-        if recluster_freq is not None and recluster_freq < 1:
-            raise ValueError(f"recluster_freq must be at least 1, got {recluster_freq}")
+        if recluster_freq is not None and not (isinstance(recluster_freq, int) and recluster_freq >= 1):
+            raise ValueError(f"recluster_freq must be an integer of at least 1, got {recluster_freq!r}")
         self.recluster_freq = recluster_freq
         self._inherit_verbosity = verbose is None
 

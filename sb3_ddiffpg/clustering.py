@@ -341,10 +341,9 @@ def _check_arguments(threshold: float | None, linkage: str, max_modes: int, min_
         raise ValueError(f"threshold must be greater than 0, or None for the automatic rule, got {threshold}")
     if linkage not in LINKAGES:
         raise ValueError(f"linkage must be one of {', '.join(LINKAGES)}, got {linkage!r}")
-    if max_modes < 1:
-        raise ValueError(f"max_modes must be at least 1, got {max_modes}")
-    if min_size < 1:
-        raise ValueError(f"min_size must be at least 1, got {min_size}")
+    for name, value in (("max_modes", max_modes), ("min_size", min_size)):
+        if not isinstance(value, (int, np.integer)) or value < 1:
+            raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
 
 
 def _check_distances(distances: np.ndarray) -> np.ndarray:

@@ -27,11 +27,11 @@ def erase_loops(path: np.ndarray, radius: float) -> np.ndarray:
     :param radius: in the unit of the path
     :return: shape ``[at most length, dims]``; begins and ends as the path does
     """
-    last_near = len(path) - 1 - (cdist(path, path) <= radius)[:, ::-1].argmax(axis=1)
     kept = [0]
-    while kept[-1] < len(path) - 1:
-        current = kept[-1]
-        kept.append(int(max(last_near[current], current + 1)))
+    while (current := kept[-1]) < len(path) - 1:
+        # One row at a time: all of them would be a matrix
+        near = np.flatnonzero(cdist(path[current : current + 1], path[current:])[0] <= radius)
+        kept.append(current + max(1, int(near[-1])))
     return path[kept]
 
 
@@ -94,7 +94,8 @@ def dtw_distances(
         gap between aligned points, in the unit of the features, whatever the episode's length
     :return: float32 array of shape ``[len(paths_a), len(paths_b)]``; with ``paths_b=None`` a symmetric one, zero on the
         diagonal. A pair's value depends on that pair alone, not on what it was computed with.
-    :raises ValueError: if a path has another shape, no points, or values that are not finite in float32
+    :raises ValueError: if a path has another shape, no points, or values that are not finite in float32, or if a distance
+        is not
     """
     rows = _check_paths(paths_a, "paths_a")
     if paths_b is None:
@@ -105,6 +106,8 @@ def dtw_distances(
         _check_dims(rows, columns)
         # The longer list fills the lanes: three paths against a thousand would leave most of them idle.
         distances = _rectangle(rows, columns) if len(columns) >= len(rows) else _rectangle(columns, rows).T
+    if not np.isfinite(distances).all():
+        raise ValueError("paths_a, paths_b: there are paths farther apart than float32 can tell")
     if normalize and distances.size:
         longest = np.maximum.outer(_lengths(rows), _lengths(columns))
         distances = distances / np.sqrt(longest.astype(np.float32))

@@ -290,11 +290,11 @@ def _space(tree: Any) -> Any:
 
 # ------------------------------------------------------------------ normalisation
 
-_Positive = Annotated[float, msgspec.Meta(gt=0)]
 _NORMALIZER_SETTINGS: dict[str, Any] = {
     **dict.fromkeys(("norm_obs", "norm_reward"), bool),
-    **dict.fromkeys(("clip_obs", "clip_reward", "epsilon"), _Positive),
-    "gamma": Annotated[float, msgspec.Meta(gt=0, le=1)],
+    **dict.fromkeys(("clip_obs", "clip_reward"), Annotated[float, msgspec.Meta(gt=0)]),
+    "epsilon": Annotated[float, msgspec.Meta(ge=0)],
+    "gamma": Annotated[float, msgspec.Meta(ge=0, le=1)],
     "norm_obs_keys": list[str] | None,
 }
 

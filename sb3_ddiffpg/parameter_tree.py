@@ -76,6 +76,8 @@ def _optimizer(optimizer: th.optim.Optimizer, own: dict[str, Any], tree: dict[st
     for group, before, present in zip(groups, own["param_groups"], optimizer.param_groups, strict=True):
         values = {key: from_plain(value) for key, value in convert(group, dict[str, Any], what).items()}
         values |= {key: before[key] for key in _OF_THE_MACHINE if key in before}
+        if isinstance(rate := values.get("lr"), float):
+            values["lr"] = max(0.0, rate)  # below zero in older files, whose schedule went beyond the end
         if set(values) != set(before) or values["params"] != before["params"]:
             raise ValueError(f"{what}: its settings are not those of a {type(optimizer).__name__}")
         for key, value in values.items():

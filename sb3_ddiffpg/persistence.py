@@ -91,6 +91,11 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         self._interrupted = None  # there may have been no step left to do
         return self
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        # The last rollout may go beyond the end, where a schedule would give a learning rate below zero
+        self._current_progress_remaining = max(0.0, self._current_progress_remaining)
+
     def dump_logs(self) -> None:
         """See SB3; a full disk does not end the training."""
         with missed_if_full("Logs"):

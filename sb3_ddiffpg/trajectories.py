@@ -104,9 +104,15 @@ def read_success(info: dict[str, Any], success_key: str | None = None) -> bool |
     :param info: Of an episode's last step
     :param success_key: Key that marks a success; None looks for ``SUCCESS_KEYS``
     :return: Whether the goal was reached, None if the environment does not say
+    :raises ValueError: If what it says is no truth value
     """
-    keys = SUCCESS_KEYS if success_key is None else (success_key,)
-    return next((bool(info[key]) for key in keys if key in info), None)
+    for key in SUCCESS_KEYS if success_key is None else (success_key,):
+        if key in info:
+            said = np.asarray(info[key])
+            if said.size != 1 or said.dtype.kind not in "biuf":
+                raise ValueError(f"info[{key!r}]: {str(info[key])[:100]} given; accepted is True or False")
+            return bool(said.item())
+    return None
 
 
 class SuccessRule:

@@ -145,8 +145,25 @@ def test_what_is_given_at_loading_is_checked_too(trained, tmp_path):
 
 
 def test_clustering_callback():
-    with pytest.raises(ValueError, match="recluster_freq must be at least 1, got 0"):
-        ClusteringCallback(0)
+    for wrong in (0, 1.5, "a"):
+        with pytest.raises(ValueError, match="recluster_freq must be an integer of at least 1, got"):
+            ClusteringCallback(wrong)
+
+
+@pytest.mark.parametrize("said", [np.array([True, False]), "yes", [], {"a": 1}], ids=str)
+def test_successes_that_are_no_truth_values(said):
+    class Says(TwoEnds):
+        def step(self, action):
+            return *super().step(action)[:4], {"is_success": said}
+
+    with pytest.raises(ValueError, match=r"info\['is_success'\]: .* given; accepted is True or False"):
+        small_model(Says()).learn(100)
+
+
+@pytest.mark.parametrize("rate", [np.float32(1e-3), np.float64(1e-3), np.int64(0)], ids=repr)
+def test_numbers_of_numpy_are_learning_rates_too(rate):
+    model = small_model(DummyVecEnv([TwoEnds] * 4), learning_rate=rate, qf_learning_rate=rate).learn(60)
+    assert model.lr_schedule(0.5) == model._qf_schedule(0.5) == float(rate)
 
 
 def test_a_batch_too_small_for_its_groups(trained, tmp_path):

@@ -38,6 +38,7 @@ from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.envs.snapshots import env_snapshot, restore_env, restore_vec_env, vec_env_snapshot
 from sb3_ddiffpg.rng import global_rng, restore_global_rng
 from sb3_ddiffpg.safe_files import read, write
+from sb3_ddiffpg.schedules import LateLinearSchedule
 
 END = 560
 
@@ -309,6 +310,23 @@ def test_a_copy_of_ones_own_is_not_the_newest(tmp_path):
     assert Path(copy).exists() and checkpoint_files(tmp_path)[0] > newest
     with pytest.raises(ValueError, match="holds a checkpoint that is further than step"):
         silent(DDiffPG.resume(copy, known_ends())).learn(400, callback=RunCheckpointCallback(tmp_path))
+
+
+@pytest.mark.parametrize("rate", [LateLinearSchedule(1e-3), lambda progress: 1e-3 * progress], ids=["late", "own"])
+def test_beyond_the_end_of_a_schedule(tmp_path, rate):
+    """The last rollout goes there. The rate was below zero then, and no optimiser can be made with such a one."""
+    model = model_for(known_ends(), learning_rate=rate)
+    model.learn(401, callback=RunCheckpointCallback(tmp_path / "run"))
+    rates = [group["lr"] for group in model.actor.optimizer.param_groups + model.critics.optimizer.param_groups]
+    assert model.num_timesteps == 416 and rates == [0.0, 0.0]
+    model.export(tmp_path / "model", optimizers=True)
+    given = {"learning_rate": rate}
+    assert DDiffPG.load(tmp_path / "model", safe=True, custom_objects=given).num_timesteps == 416
+    tree = read(checkpoint_files(tmp_path / "run")[0], KIND)
+    tree["model"]["parameters"]["actor.optimizer"]["groups"][0]["lr"] = -1e-5  # as older ones have it
+    write(tmp_path / "older", KIND, tree)
+    resumed = silent(DDiffPG.resume(tmp_path / "older", known_ends(), custom_objects=given))
+    assert resumed.learn(800).num_timesteps == 800
 
 
 def test_as_many_environments_as_the_run_had(tmp_path):

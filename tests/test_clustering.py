@@ -169,8 +169,10 @@ def test_equal_distances_above_the_threshold_are_outliers():
         ({"threshold": 0.0}, "threshold must be greater than 0.*got 0.0"),
         ({"threshold": float("nan")}, "threshold must be greater than 0"),
         ({"linkage": "ward"}, "linkage must be one of average, complete, single, weighted, got 'ward'"),
-        ({"max_modes": 0}, "max_modes must be at least 1, got 0"),
-        ({"min_size": 0}, "min_size must be at least 1, got 0"),
+        ({"max_modes": 0}, "max_modes must be an integer of at least 1, got 0"),
+        ({"max_modes": 1.5}, "max_modes must be an integer of at least 1, got 1.5"),
+        ({"min_size": 0}, "min_size must be an integer of at least 1, got 0"),
+        ({"min_size": float("nan")}, "min_size must be an integer of at least 1, got nan"),
     ],
 )
 def test_arguments_out_of_range(arguments, message):

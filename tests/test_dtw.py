@@ -1,3 +1,4 @@
+import tracemalloc
 from itertools import pairwise
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 from dtaidistance import dtw_ndim
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import cdist
 
 from sb3_ddiffpg.dtw import LANES, dtw_distances, erase_loops, resample_path
 
@@ -172,6 +174,32 @@ def test_resampling_checks_its_arguments():
         resample_path(np.zeros((0, 2)), 3)
     with pytest.raises(ValueError, match="path holds values"):
         resample_path(np.array([[0.0, np.nan]]), 3)
+
+
+def test_paths_too_far_apart_for_a_distance():
+    for normalize in (True, False):
+        with pytest.raises(ValueError, match="farther apart than float32 can tell"):
+            dtw_distances([np.zeros((2, 1)), np.full((2, 1), 1e30)], normalize=normalize)
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 10_000), length=st.integers(1, 80), radius=st.floats(0.0, 3.0))
+def test_loops_are_erased_as_by_the_matrix_of_all_distances(seed, length, radius):
+    path = np.cumsum(np.random.default_rng(seed).normal(size=(length, 2)), axis=0)
+    near = cdist(path, path) <= radius
+    place, kept = 0, [0]
+    while place < length - 1:
+        place = max(place + 1, max(i for i in range(length) if near[place, i]))
+        kept.append(place)
+    np.testing.assert_array_equal(erase_loops(path, radius), path[kept])
+
+
+def test_a_long_path_needs_no_matrix():
+    path = np.linspace((0.0, 0.0), (1.0, 1.0), 20_000)
+    tracemalloc.start()
+    erase_loops(path, 0.05)
+    assert tracemalloc.get_traced_memory()[1] < 10e6
+    tracemalloc.stop()
 
 
 def test_loops_are_erased_by_hand():

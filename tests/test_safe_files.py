@@ -301,6 +301,13 @@ def test_statistics_that_no_observations_have(tmp_path):
             build_model(DDiffPG, tree, env)
 
 
+def test_normalisation_at_the_edges(tmp_path):
+    env = VecNormalize(DummyVecEnv([TwoEnds] * 2), gamma=0.0, epsilon=0.0, clip_obs=np.inf)
+    small_model(env).learn(40).export(tmp_path / "model")
+    loaded = DDiffPG.load(tmp_path / "model", env=DummyVecEnv([TwoEnds] * 2), safe=True).get_vec_normalize_env()
+    assert (loaded.gamma, loaded.epsilon, loaded.clip_obs) == (0.0, 0.0, np.inf)
+
+
 def test_normalised_observations(tmp_path):
     env = VecNormalize(DummyVecEnv([TwoEnds] * 2), norm_reward=False, clip_obs=7.0)
     model = small_model(env)

@@ -90,6 +90,29 @@ def test_an_error_names_its_environment(fragile):
     assert not any(process.is_alive() for process in fragile.processes)
 
 
+def test_an_error_of_ones_own_kind_and_an_answer_that_cannot_be_sent():
+    """The main process may not know the one's class, nor be sent the other."""
+
+    class SimulatorError(Exception):
+        pass
+
+    class Odd(TwoEnds):
+        def step(self, action):
+            if action[0] > 0.99:
+                raise SimulatorError("joint 3 exploded")
+            return *super().step(action)[:4], {"function": lambda: 1} if action[0] < -0.99 else {}
+
+    for action, said in (
+        (1.0, r"(?s)Environment 1 raised an error:.*SimulatorError: joint 3 exploded"),
+        (-1.0, r"(?s)The worker process with environments 0 to 2 raised an error:.*Can't pickle local object"),
+    ):
+        env = WorkerVecEnv([Odd] * 3, n_workers=1)
+        env.reset()
+        with pytest.raises(RuntimeError, match=said):
+            env.step(np.array([[0.0], [action], [0.0]]))
+        assert not any(process.is_alive() for process in env.processes)
+
+
 @pytest.mark.parametrize("cause", ["killed", "exited"])
 def test_a_dead_worker_is_reported_and_does_not_hang(fragile, cause):
     started = time.perf_counter()

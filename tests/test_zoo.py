@@ -178,6 +178,20 @@ def test_workers_of_the_zoo_survive_an_interrupt(tmp_path):
     assert checkpoint_files(run / "checkpoints")[0].stem > "checkpoint_000000000000" and (run / f"{ENV}.zip").exists()
 
 
+@pytest.mark.parametrize("text", ["", "[1, 2]", f"{ENV}: [1]", f"{ENV}:", f"{ENV}: {{5: 3}}", "a: [", "\\x00"], ids=range(7))
+def test_files_of_settings_that_hold_none(tmp_path, text):
+    (tmp_path / "own.yml").write_text(text)
+    with pytest.raises(SystemExit, match=rf"--conf-file: {tmp_path}/own.yml "):
+        main(["train", "--env", ENV, "--conf-file", str(tmp_path / "own.yml"), "-f", str(tmp_path)])
+
+
+def test_settings_that_are_no_python(tmp_path):
+    (tmp_path / "own.yml").write_text(f"{ENV}: {{n_timesteps: 100, policy: MlpPolicy, policy_kwargs: 'dict('}}")
+    for options in (["--conf-file", str(tmp_path / "own.yml")], ["--hyperparams", "batch_size:3 +"]):
+        with pytest.raises(SystemExit, match="in the settings is no expression of Python"):
+            main(["train", "--env", ENV, "-f", str(tmp_path), *options])
+
+
 def test_resuming_refuses_unknown_keys(run, tmp_path):
     # the zoo would set an attribute that nobody reads
     with pytest.raises(TypeError, match="'recluster_frq' is not a hyperparameter of ddiffpg: did you mean 'recluster_freq'"):

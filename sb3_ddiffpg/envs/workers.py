@@ -35,7 +35,10 @@ _NOBODY = -1
 
 
 def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper, turn: Any) -> None:
-    """What a worker does: it answers each command with ``("ok", result)`` or ``("error", (environment, error, text))``."""
+    """
+    What a worker does: it answers each command with ``("ok", result)`` or ``("error", (environment, lacks, text))``, where
+    ``lacks`` says whether it was an AttributeError; a class of one's own may be known here alone.
+    """
     parent.close()
     for number in (signal.SIGINT, signal.SIGTERM):  # they may reach all processes; the parent says what happens now
         signal.signal(number, signal.SIG_IGN)
@@ -45,6 +48,7 @@ def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper, t
             command, argument = remote.recv()
         except EOFError:
             break  # the parent is gone
+        answered = False
         try:
             if command == "make":
                 envs = _make(wrapped.var, turn)
@@ -53,9 +57,11 @@ def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper, t
                 break
             else:
                 result = _answer(envs, command, argument)
+            answered = True
             remote.send(("ok", result))
-        except Exception as error:
-            remote.send(("error", (turn.value, type(error), traceback.format_exc())))
+        except Exception as error:  # of an environment, or of an answer that cannot be sent
+            lacks = isinstance(error, AttributeError) and not answered
+            remote.send(("error", (_NOBODY if answered else turn.value, lacks, traceback.format_exc())))
     if envs is not None:
         envs.close()
     remote.close()
@@ -186,11 +192,12 @@ class WorkerVecEnv(VecEnv):
         answers = [self._hear_one(worker) for worker in range(len(self.remotes))]
         for worker, (status, result) in enumerate(answers):
             if status == "error":
-                env, kind, text = result
-                if issubclass(kind, AttributeError):
-                    raise AttributeError(f"Environment {self.first[worker] + env} raised an error:\n{text}")
+                env, lacks, text = result
+                message = f"{self._who(worker, env)} raised an error:\n{text}"
+                if lacks:
+                    raise AttributeError(message)
                 self.close()
-                raise RuntimeError(f"Environment {self.first[worker] + env} raised an error:\n{text}")
+                raise RuntimeError(message)
         return [result for _, result in answers]
 
     def _hear_one(self, worker: int) -> tuple[str, Any]:
@@ -213,8 +220,7 @@ class WorkerVecEnv(VecEnv):
         return self._fail(worker)
 
     def _give_up(self, worker: int) -> NoReturn:
-        turn, first, last = self._turns[worker].value, self.first[worker], self.first[worker + 1] - 1
-        who = f"The worker process with environments {first} to {last}" if turn == _NOBODY else f"Environment {first + turn}"
+        who = self._who(worker, self._turns[worker].value)
         for process in self.processes:
             process.kill()  # who hangs would not hear that he is to close
         self.close()
@@ -223,11 +229,15 @@ class WorkerVecEnv(VecEnv):
     def _fail(self, worker: int) -> NoReturn:
         process = self.processes[worker]
         process.join(timeout=5)
-        code, first, last = process.exitcode, self.first[worker], self.first[worker + 1] - 1
+        code = process.exitcode
         self.close()
         cause = f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
         hint = "" if self._made else ". A script that makes such environments must do so under `if __name__ == '__main__':`"
-        raise RuntimeError(f"The worker process with environments {first} to {last} has died ({cause}){hint}")
+        raise RuntimeError(f"{self._who(worker)} has died ({cause}){hint}")
+
+    def _who(self, worker: int, turn: int = _NOBODY) -> str:
+        first, last = self.first[worker], self.first[worker + 1] - 1
+        return f"The worker process with environments {first} to {last}" if turn == _NOBODY else f"Environment {first + turn}"
 
     # ------------------------------------------------------------------ VecEnv
 

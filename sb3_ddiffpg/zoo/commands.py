@@ -24,7 +24,7 @@ from sb3_ddiffpg.checkpoints import checkpoint_files
 from sb3_ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.zoo.manager import ModeExperimentManager
 from sb3_ddiffpg.zoo.registration import register
-from sb3_ddiffpg.zoo.settings import ALGO, ALGOS, config_file
+from sb3_ddiffpg.zoo.settings import ALGO, ALGOS, check_config_file, config_file
 
 # Environment steps between two checkpoints, unless --checkpoint-freq says otherwise
 CHECKPOINT_FREQ = 100_000
@@ -89,6 +89,7 @@ def train(arguments: Sequence[str]) -> None:
     if path is not None and not Path(path).is_file() and not _is_module(str(path)):
         ours = sorted(each.stem for each in config_file(ALGO).parent.glob("*.yml"))  # type: ignore[union-attr]
         raise SystemExit(f"--conf-file: {known.conf_file!r} given; accepted are a YAML or Python file, a module, and {ours}")
+    check_config_file(path, known.env)
     if known.resume is not None and known.hyperparams:
         print("--resume: the run goes on with its own settings, not with what --hyperparams says")
     resume = None if known.resume is None else _run_folder(known.resume, known.log_folder, known.algo, known.env)
@@ -98,6 +99,10 @@ def train(arguments: Sequence[str]) -> None:
         rl_zoo3.train.ExperimentManager = manager  # type: ignore[assignment, misc]
         with _command_line([*([] if path is None else ["--conf-file", str(path)]), *rest]):
             rl_zoo3.train.train()
+    except SyntaxError as error:
+        if error.filename != "<string>":
+            raise
+        raise SystemExit(f"{(error.text or '').strip()!r} in the settings is no expression of Python: {error.msg}") from None
     finally:
         rl_zoo3.train.ExperimentManager = ModeExperimentManager  # type: ignore[misc]
 

@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Sequence
 from pathlib import Path
 
+import yaml
 from rl_zoo3.utils import ALGOS
 
 from sb3_ddiffpg.model_file import constructor_arguments
@@ -38,6 +39,25 @@ def config_file(name: str) -> Path | None:
         if (path := folder / "zoo_hyperparams" / f"{name}.yml").is_file():
             return path
     return None
+
+
+def check_config_file(path: str | Path | None, env_id: str | None) -> None:
+    """
+    :param path: Of a YAML file; anything else is not looked at
+    :param env_id: Whose settings must be such
+    :raises SystemExit: If it is no mapping of environments to mappings of hyperparameters
+    """
+    if path is None or Path(path).suffix not in (".yml", ".yaml"):
+        return
+    try:
+        settings = yaml.safe_load(Path(path).read_text())
+    except (yaml.YAMLError, UnicodeError) as error:
+        raise SystemExit(f"--conf-file: {path} is no YAML file: {error}") from None
+    if not isinstance(settings, dict):
+        raise SystemExit(f"--conf-file: {path} holds {str(settings)[:99]!r}; accepted is a mapping of environments")
+    own = settings.get(env_id, {})
+    if not isinstance(own, dict) or not all(isinstance(key, str) for key in own):
+        raise SystemExit(f"--conf-file: {path} has {str(own)[:100]!r} for {env_id}; accepted is a mapping of hyperparameters")
 
 
 def check_hyperparameters(algo: str, keys: Sequence[str]) -> None:
