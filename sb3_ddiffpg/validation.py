@@ -150,24 +150,30 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
 )
 
 
+def check_ranges(arguments: dict[str, Any]) -> None:
+    """
+    :param arguments: Some of an algorithm's, by name
+    :raises ValueError: For the first that cannot work, whatever the others are
+    """
+    for names, accepted, is_right in RANGES:
+        for name in [each for each in names if each in arguments]:
+            try:
+                right, problem = is_right(arguments[name]), None
+            except Exception as error:  # of a schedule
+                right, problem = False, error
+            if not right:
+                why = "" if problem is None else f": {problem!r}"
+                raise ValueError(f"{name} must {accepted}, got {arguments[name]!r}{why}") from problem
+
+
 def check_arguments(model: Any, policy_arguments: Callable[[], dict[str, Any]]) -> None:
     """
     :param model: An algorithm whose arguments are set
     :param policy_arguments: Gives the arguments of its policy that follow from its own, where these are right
     :raises ValueError: For the first argument that cannot work
     """
-    for names, accepted, is_right in RANGES:
-        for name in names:
-            if not hasattr(model, name):
-                continue
-            value = getattr(model, name)
-            try:
-                right, problem = is_right(value), None
-            except Exception as error:  # of a schedule
-                right, problem = False, error
-            if not right:
-                why = "" if problem is None else f": {problem!r}"
-                raise ValueError(f"{name} must {accepted}, got {value!r}{why}") from problem
+    names = [name for each, *_ in RANGES for name in each if hasattr(model, name)]
+    check_ranges({name: getattr(model, name) for name in names})
     if model.optimize_memory_usage:
         raise ValueError("optimize_memory_usage=True is not supported: trajectories do not lie in one ring")
     given = model.replay_buffer_class

@@ -164,6 +164,8 @@ def test_settings_that_do_not_exist(monkeypatch, tmp_path, capsys):
         (("--again", str(tmp_path), "--seed", "5"), "--again: given beside seed"),
         ((*point, "--override", "{n_envs: 0}"), "n_envs: 0 given"),
         ((*point, "--override", "{n_timesteps: true}"), "n_timesteps: True given"),
+        ((*point, "--override", "{gamma: 7}"), r"settings of .*: gamma must lie in \[0, 1\], got 7"),
+        ((*point, "--override", "{linkage: null}"), "linkage must be one of"),
         ((*point, "--override", "{env_kwargs: {maze: V9}}"), "PointMazeV1-v0 cannot be made with env_kwargs maze: V9"),
         ((*point, "--override", "{gamma: 0.5, gamma: 0.9}"), "'gamma' stands twice"),
     ):

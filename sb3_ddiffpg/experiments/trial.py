@@ -13,6 +13,8 @@ import msgspec
 import yaml
 
 from sb3_ddiffpg.experiments.files import read_yaml
+from sb3_ddiffpg.persistence import SavableAlgorithm
+from sb3_ddiffpg.validation import check_ranges
 from sb3_ddiffpg.zoo import ALGOS, check_hyperparameters, config_file, register
 
 
@@ -67,7 +69,9 @@ class Trial(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
                 raise ValueError(f"env: {env_id!r} given; accepted is the id of a registered environment")
         try:
             check_hyperparameters(self.algo, list(self.hyperparams))
-        except TypeError as error:
+            if issubclass(ALGOS[self.algo], SavableAlgorithm):  # the zoo makes more of texts and lists
+                check_ranges({name: each for name, each in self.hyperparams.items() if not isinstance(each, (str, list))})
+        except (TypeError, ValueError) as error:
             raise ValueError(f"settings of {self.variant} in {self.env}: {error}") from None
         if re.fullmatch(r"\w([\w .,+=()-]{0,59}[\w.,+=()-])?", self.variant) is None:
             accepted = "1 to 61 letters, digits, blanks and .,+=()-_ that begin with a letter or digit and end with no blank"
