@@ -84,8 +84,8 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     (("max_grad_norm",), "be positive", lambda value: _is_number(value) and value > 0),
     (
         ("action_lr", "reward_scale", "intrinsic_clip"),
-        "be positive and finite",
-        lambda value: _is_number(value) and 0 < value < np.inf,
+        f"be positive and below {LARGEST:g}",
+        lambda value: _is_moderate(value) and value > 0,
     ),
     (
         ("exploration_v_max",),
@@ -98,8 +98,8 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
             *("new_way_coef", "q_coef", "bc_coef", "consistency_coef", "reward_loss_coef", "value_loss_coef"),
             *("state_loss_coef", "initial_entropy_coef", "entropy_learning_rate"),
         ),
-        "be a finite number of at least 0",
-        lambda value: _is_number(value) and 0 <= value < np.inf,
+        f"be at least 0 and below {LARGEST:g}",
+        lambda value: _is_moderate(value) and value >= 0,
     ),
     (("v_min", "v_max"), f"be a number between -{LARGEST:g} and {LARGEST:g}", _is_moderate),
     (("learning_rate",), "lie in [0, 1000], or be a schedule of such numbers", _is_rate),
@@ -110,8 +110,8 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     ),
     (
         ("latent_coef",),
-        "be a finite number of at least 0 or a schedule of such",
-        _or_schedule(lambda value: _is_number(value) and 0 <= value < np.inf),
+        f"be at least 0 and below {LARGEST:g}, or be a schedule of such numbers",
+        _or_schedule(lambda value: _is_moderate(value) and value >= 0),
     ),
     (
         ("exploration_share",),
@@ -120,8 +120,8 @@ RANGES: tuple[tuple[tuple[str, ...], str, Callable[[Any], bool]], ...] = (
     ),
     (
         ("target_entropy",),
-        "be a finite number or None",
-        lambda value: value is None or (_is_number(value) and np.isfinite(value)),
+        f"be a number between -{LARGEST:g} and {LARGEST:g}, or None",
+        lambda value: value is None or _is_moderate(value),
     ),
     (
         ("n_levels",),

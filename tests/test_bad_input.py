@@ -68,7 +68,7 @@ BAD_ARGUMENTS = [
     ("optimize_memory_usage", True),
     ("replay_buffer_class", ReplayBuffer),
     ("replay_buffer_class", "ModeReplayBuffer"),
-    *((name, 1e39) for name in ("v_max", "exploration_v_max", "learning_rate")),
+    *((name, 1e39) for name in ("v_max", "exploration_v_max", "learning_rate", "action_lr", "reward_scale", "intrinsic_coef")),
     *(("gamma", value) for value in (10**400, -(10**400))),
     *(("exploration_share", share) for share in (lambda progress: np.nan, lambda progress: 2 * progress, dict, "lin_0.5")),
     *(("learning_rate", rate) for rate in (lambda progress: 1 / progress, LinearSchedule(1e-3, -1e-3, 0.5), "3e-4")),

@@ -75,7 +75,7 @@ def test_what_it_is_worth_follows_a_schedule():
         constant = small(latent_coef=0.8 * remaining)
         assert th.equal(scheduled, imagined(constant, states, latents)[0])
     for wrong in (-0.1, float("nan"), "0.1"):
-        with pytest.raises(ValueError, match="latent_coef must be a finite number"):
+        with pytest.raises(ValueError, match="latent_coef must be at least 0"):
             small(latent_coef=wrong)
 
 
