@@ -28,7 +28,7 @@ KIND = "model"
 MOST_ENVS = 2**16
 MOST = {
     **dict.fromkeys(("n_diffusion_steps", "n_action_gradient_steps", "n_candidates", "n_path_points"), 10_000),
-    **dict.fromkeys(("n_steps", "mode_n_steps", "exploration_n_steps", "gradient_steps"), 100_000),
+    **dict.fromkeys(("n_steps", "mode_n_steps", "exploration_n_steps", "gradient_steps", "train_freq"), 100_000),
     "batch_size": 2**24,
 }
 # Of arrays of numbers
@@ -209,6 +209,7 @@ def _check_arguments(arguments: dict[str, Any], parameters: dict[str, dict[str, 
     of_buffer = arguments.get("replay_buffer_kwargs")
     for name, most in MOST.items():
         value = {**(of_buffer if isinstance(of_buffer, dict) else {}), **arguments}.get(name)
+        value = value[0] if isinstance(value, tuple) and value else value  # with its unit
         if isinstance(value, int) and value > most:
             raise ValueError(f"model.arguments.{name}: {value} given; accepted is at most {most} in a file")
     n_arrays = sum(map(len, parameters.values()))

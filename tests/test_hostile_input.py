@@ -143,6 +143,7 @@ def test_a_checkpoint_with_something_else_in_it(data):
         model.set_logger(Logger(None, []))
         for name, most in (("batch_size", 10**4), ("gradient_steps", 10), ("n_action_gradient_steps", 10), ("train_freq", 10)):
             value = getattr(model, name)  # longer than a test may take
+            value = value.frequency if name == "train_freq" else value
             assume(not isinstance(value, int) or value <= most)
         try:
             model.learn(model.num_timesteps - model._learn_began_at + 40)

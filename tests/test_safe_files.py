@@ -586,6 +586,8 @@ def test_normalisation_below_another_wrapper_is_found(tmp_path):
         (("policy",), "LstmPolicy", "'LstmPolicy' given; accepted are"),
         (("arguments", "replay_buffer_kwargs"), {"dict": {"n_path_points": 10**9}}, "n_path_points: 1000000000 given"),
         (("arguments", "train_freq"), {"tuple": [0, "step"]}, "train_freq must be"),
+        (("arguments", "train_freq"), {"tuple": [10**12, "step"]}, "train_freq: 1000000000000 given"),
+        (("arguments", "train_freq"), 10**12, "train_freq: 1000000000000 given"),
         (("arguments", "gamma"), 2**70, "gamma must lie"),
         (("arguments", "n_action_gradient_steps"), 10**9, "n_action_gradient_steps: 1000000000 given"),
         (("arguments", "batch_size"), 10**12, "batch_size: 1000000000000 given"),
