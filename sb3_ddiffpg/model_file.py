@@ -207,8 +207,9 @@ def _arguments(plain: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
 def _check_arguments(arguments: dict[str, Any], parameters: dict[str, dict[str, Any]]) -> None:
     """Those by which a small file could ask for hours."""
     of_buffer = arguments.get("replay_buffer_kwargs")
+    bounded = {**(of_buffer if isinstance(of_buffer, dict) else {}), **arguments}
     for name, most in MOST.items():
-        value = {**(of_buffer if isinstance(of_buffer, dict) else {}), **arguments}.get(name)
+        value = bounded.get(name)
         value = value[0] if isinstance(value, tuple) and value else value  # with its unit
         if isinstance(value, int) and value > most:
             raise ValueError(f"model.arguments.{name}: {value} given; accepted is at most {most} in a file")

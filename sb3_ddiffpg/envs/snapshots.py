@@ -205,9 +205,8 @@ def restore_normalization(env: VecNormalize, tree: Any) -> None:
     for target, saved in pairs:
         for name in ("mean", "var"):
             check_array(getattr(saved, name), np.float64, np.shape(getattr(target, name)), f"normalization.{name}")
-        if not ((np.abs(saved.mean) < LARGEST).all() and (0 <= saved.var).all() and (saved.var < LARGEST**2).all()):
-            raise ValueError("normalization: there are numbers that no observations have")
-        if not 0 <= saved.count < 2**53:
+        moments = (np.abs(saved.mean) < LARGEST).all() and ((0 <= saved.var) & (saved.var < LARGEST**2)).all()
+        if not (moments and 0 <= saved.count < 2**53):
             raise ValueError("normalization: there are numbers that no observations have")
     for target, saved in pairs:
         target.mean, target.var, target.count = saved.mean.copy(), saved.var.copy(), saved.count
