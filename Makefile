@@ -19,7 +19,7 @@ slow: .venv/.installed-dev
 
 # the tests use the CPU unless they are told otherwise
 gpu: .venv/.installed-dev
-	CUDA_VISIBLE_DEVICES=0 CUBLAS_WORKSPACE_CONFIG=:4096:8 $(BIN)/python -m pytest tests/test_accelerator.py
+	CUDA_VISIBLE_DEVICES=0 CUBLAS_WORKSPACE_CONFIG=:4096:8 $(BIN)/python -m pytest tests/networks/test_accelerator.py
 
 # an input that fails is left in crash-*; SECONDS for each test
 SECONDS ?= 3600

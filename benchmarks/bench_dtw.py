@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from dtaidistance import dtw_ndim
 
-from sb3_ddiffpg.dtw import dtw_distances
+from sb3_ddiffpg.clustering.dtw import dtw_distances
 
 LENGTHS = (48, 100, 300)
 

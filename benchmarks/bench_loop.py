@@ -18,11 +18,10 @@ import yaml
 from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
-from torch import nn  # noqa: F401, of the policy_kwargs
 
 from sb3_ddiffpg import DDiffPG
+from sb3_ddiffpg.common.presets import config_file, preset
 from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.zoo import config_file
 
 CONFIG = {"PointMazeV1-v0": "ddiffpg", "AntMazeV1-v0": "ddiffpg-cpu"}
 
@@ -85,17 +84,16 @@ def measure(
     path = config_file(conf_file)
     assert path is not None
     entry = yaml.safe_load(path.read_text())[env_id]
-    entry.pop("n_timesteps")
-    kwargs = {**entry.pop("env_kwargs", {}), **({"n_threads": simulator_threads} if env_id.startswith("Ant") else {})}
-    env = make_vec_env(env_id, entry.pop("n_envs"), seed=0, **kwargs)
+    kwargs = {**entry.get("env_kwargs", {}), **({"n_threads": simulator_threads} if env_id.startswith("Ant") else {})}
+    env = make_vec_env(env_id, entry["n_envs"], seed=0, **kwargs)
     if algo == "DDiffPG":
-        if "policy_kwargs" in entry:
-            entry["policy_kwargs"] = eval(entry["policy_kwargs"])  # as the zoo does
-        model: Any = DDiffPG(entry.pop("policy"), env, seed=0, **entry)
+        model: Any = DDiffPG.from_preset(f"{conf_file}:{env_id}", env, seed=0)
     else:
-        sizes = eval(entry["policy_kwargs"])["net_arch"] if "policy_kwargs" in entry else [128, 128]
-        shared = {name: entry[name] for name in ("learning_starts", "gradient_steps", "batch_size", "gamma") if name in entry}
-        model = TD3("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": sizes}, **{"gradient_steps": 1, **shared})
+        settings = preset(f"{conf_file}:{env_id}")
+        sizes = settings.get("policy_kwargs", {}).get("net_arch", [128, 128])
+        names = ("learning_starts", "gradient_steps", "batch_size", "gamma")
+        shared = {"gradient_steps": 1, **{name: settings[name] for name in names if name in settings}}
+        model = TD3("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": sizes}, **shared)
     model.set_logger(configure(None, []))
     times: dict[str, float] = defaultdict(float)
     timed(env, "step", "simulation", times)

@@ -9,8 +9,8 @@ import time
 
 import numpy as np
 
-from sb3_ddiffpg.clustering import cluster
-from sb3_ddiffpg.trajectories import DistanceCache
+from sb3_ddiffpg.clustering.distance_cache import DistanceCache
+from sb3_ddiffpg.clustering.linkage import cluster
 
 COUNTS = (50, 200, 500, 1000, 2000)
 N_NEW, N_ROUTES = 50, 4

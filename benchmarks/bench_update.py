@@ -15,7 +15,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-import yaml
 from gymnasium import spaces
 from plain_update import PlainUpdate
 from stable_baselines3 import TD3
@@ -25,8 +24,8 @@ from timing import clock, median_ms
 from torch import nn
 
 from sb3_ddiffpg import DDiffPG
-from sb3_ddiffpg.trajectories import NO_MODE
-from sb3_ddiffpg.zoo import config_file
+from sb3_ddiffpg.buffers.trajectory import NO_MODE
+from sb3_ddiffpg.common.presets import preset
 
 N_MODES = 2
 PARTS = {
@@ -78,6 +77,7 @@ def filled(observation_dim: int, action_dim: int, **settings: Any) -> DDiffPG:
     model.set_logger(configure(None, []))
     model.learn(20_000, callback=None, log_interval=10**9)
     buffer = model.replay_buffer
+    model.mode_manager.expect_unknown(N_MODES, model.num_timesteps, buffer, model.scheduler)
     model.policy.inherit([None] * N_MODES, [False] * N_MODES)
     successes, failures = buffer.trajectories(True), buffer.trajectories(False)
     labels = [np.arange(len(part)) % N_MODES for part in (successes, failures)]
@@ -128,7 +128,7 @@ def small(seconds: float, device: str) -> None:
     :param seconds: Spent on it
     :param device: Of the networks
     """
-    model = filled(4, 2, gamma=0.97, exploration_n_steps=3, device=device)
+    model = filled(4, 2, gamma=0.97, exploration={"n_steps": 3}, device=device)
     env: Any = DummyVecEnv([lambda: Noise(4, 2)] * 20)
     hidden = dict(net_arch=[128, 128])
     td3 = TD3("MlpPolicy", env, batch_size=256, learning_starts=10**9, buffer_size=50_000, policy_kwargs=hidden, device=device)
@@ -168,11 +168,8 @@ def paper(batch_size: int, seconds: float, activation: str, device: str) -> None
     :param activation: Of the policy, "mish" as in the authors' code, or "silu"
     :param device: Of the networks
     """
-    path = config_file("ddiffpg")
-    assert path is not None
-    entry = yaml.safe_load(path.read_text())["paper"]
-    drop = {"policy", "n_envs", "n_timesteps", "policy_kwargs", "replay_buffer_kwargs", "learning_starts", "buffer_size"}
-    settings = {name: value for name, value in entry.items() if name not in drop}
+    drop = {"policy", "policy_kwargs", "replay_buffer_kwargs", "learning_starts", "buffer_size"}
+    settings = {name: value for name, value in preset("paper").items() if name not in drop}
     settings |= {"device": device, "replay_buffer_kwargs": {"storage_device": "auto"}}
 
     def kwargs(activation_fn: type[nn.Module]) -> dict[str, Any]:

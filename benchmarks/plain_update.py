@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from sb3_ddiffpg import DDiffPG
-from sb3_ddiffpg.critics import project_distribution
+from sb3_ddiffpg.networks.critics import project_distribution
 
 
 class PlainCritic(nn.Module):
@@ -65,12 +65,12 @@ class PlainUpdate:
 
     def __init__(self, model: DDiffPG) -> None:
         self.model = model
-        groups, twins = range(model.critics.n_groups), range(model.n_critics)
+        groups, twins = range(model.critics.n_groups), range(model.critics.n_critics)
         self.critics = nn.ModuleList([nn.ModuleList([PlainCritic(model.critics, g, c) for c in twins]) for g in groups])
         self.critics.to(model.device)
         self.targets = copy.deepcopy(self.critics)
         self.denoiser = PlainDenoiser(model.actor.diffusion.denoiser).to(model.device)
-        self.novelty: Any = copy.deepcopy(model.novelty_model)
+        self.novelty: Any = copy.deepcopy(model.bonus.novelty_model)
         self.critic_optimizers = [th.optim.AdamW(pair.parameters(), lr=5e-4, foreach=False) for pair in self.critics]
         self.actor_optimizer = th.optim.AdamW(self.denoiser.parameters(), lr=3e-4, foreach=False)
 
@@ -105,7 +105,7 @@ class PlainUpdate:
         return actions.grad
 
     def _value(self, logits: th.Tensor, group: int) -> th.Tensor:
-        if self.model.n_atoms == 1:
+        if self.model.critics.n_atoms == 1:
             return logits[:, 0]
         return (logits.softmax(dim=-1) * self.model.critics.atoms[min(group, 1)]).sum(dim=-1)
 
@@ -114,7 +114,8 @@ class PlainUpdate:
         :param batch_size: Transitions over all groups
         """
         model, policy = self.model, self.model.policy
-        batch = model._sample_modes(batch_size)
+        n_steps = model.exploration_settings.n_steps, model.mode_settings.n_steps
+        batch = model.replay_buffer.sample_modes(batch_size, model.gamma, *n_steps)
         n_groups, n = batch.rows.shape
         positions = model.replay_buffer.features.of_tensors(model.replay_buffer.read_observations(batch.rows[0])[1])
         features = policy.critic_features(batch.observations).detach()
@@ -146,12 +147,12 @@ class PlainUpdate:
             loss.backward()
             self.critic_optimizers[group].step()
             actions = batch.target_actions[group].clone()
-            mean, square = th.zeros_like(actions), th.zeros_like(actions)
-            for step in range(1, model.n_action_gradient_steps + 1):
+            mean, square, ascent_settings = th.zeros_like(actions), th.zeros_like(actions), model.target_action_settings
+            for step in range(1, ascent_settings.n_steps + 1):
                 ascent = self.action_gradient(group, features[group], actions)
                 mean, square = 0.9 * mean + 0.1 * ascent, 0.999 * square + 0.001 * ascent.pow(2)
                 ascent = (mean / (1 - 0.9**step)) / ((square / (1 - 0.999**step)).sqrt() + 1e-8)
-                actions = (actions + model.action_lr * ascent).clamp(-1, 1)
+                actions = (actions + ascent_settings.learning_rate * ascent).clamp(-1, 1)
             improved.append(actions)
         clean = th.cat(improved)
         condition = th.cat((features.flatten(0, 1), policy.mode_embeddings.repeat_interleave(n, 0)), dim=1)

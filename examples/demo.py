@@ -1,5 +1,5 @@
 """
-Train DDiffPG on a point maze, command each mode that it found, and draw the routes. The settings are those of
+Train DDiffPG on a point maze, command each mode that it found, and draw the paths. The settings are those of
 ``zoo_hyperparams/ddiffpg.yml``.
 """
 
@@ -15,22 +15,23 @@ import yaml
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.evaluation import clustering_agreement, evaluate_modes
-from sb3_ddiffpg.plots import plot_routes
+from sb3_ddiffpg.visualization.plots import plot_routes
 
 PRESETS = Path(__file__).parent.parent / "zoo_hyperparams" / "ddiffpg.yml"
+OF_TRAINING = ("n_envs", "n_timesteps")  # the rest is the model's
 
 
 def train(env_id: str, seed: int, overrides: dict[str, Any]) -> DDiffPG:
     """
     :param env_id: An environment with a preset
     :param seed: Seed of the run
-    :param overrides: Settings that replace the preset's
+    :param overrides: What is to be different from the preset
     :return: The trained model
     """
-    preset = yaml.safe_load(PRESETS.read_text())[env_id] | overrides
-    env = make_vec_env(env_id, preset.pop("n_envs"), seed=seed)
-    n_timesteps = int(preset.pop("n_timesteps"))
-    model = DDiffPG(preset.pop("policy"), env, seed=seed, verbose=1, **preset)
+    n_envs, n_timesteps = (int((yaml.safe_load(PRESETS.read_text())[env_id] | overrides)[name]) for name in OF_TRAINING)
+    changes = {name: value for name, value in overrides.items() if name not in OF_TRAINING}
+    env = make_vec_env(env_id, n_envs, seed=seed)
+    model = DDiffPG.from_preset(f"ddiffpg:{env_id}", env, seed=seed, verbose=1, **changes)
     model.learn(n_timesteps, log_interval=10**9, progress_bar=True)
     return model
 
@@ -41,7 +42,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=100, help="test episodes for each mode")
     parser.add_argument("--output", type=Path, default=Path("logs/demo"))
-    parser.add_argument("--override", type=yaml.safe_load, default={}, help="settings as YAML, such as '{max_modes: 1}'")
+    parser.add_argument("--override", type=yaml.safe_load, default={}, help="settings as YAML, such as '{modes.max_modes: 1}'")
     options = parser.parse_args()
     th.set_num_threads(1)  # small networks: a second thread costs more than it brings
 

@@ -1,5 +1,5 @@
 """
-Ways are blocked that were open in training: a DDiffPG trained on the maze V3 (by ``examples/demo.py --env PointMazeV3-v0``)
+Passages are blocked that were open in training: a DDiffPG trained on V3 (by ``examples/demo.py --env PointMazeV3-v0``)
 with and without replanning, and SB3's TD3 trained on V3 for as many steps, on ``PointMazeRandom-v0``.
 """
 
@@ -14,9 +14,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.episodes import run_episodes
-from sb3_ddiffpg.evaluation import evaluate_modes
-from sb3_ddiffpg.replanning import Replanner
+from sb3_ddiffpg.evaluation import Replanner, evaluate_modes, run_episodes
 
 
 def train_td3(seed: int) -> TD3:

@@ -3,11 +3,11 @@
 import sb3_ddiffpg.envs  # noqa: F401 - registers the environments
 from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.callbacks import ClusteringCallback, EvaluateModesCallback, ModeEvalCallback, ModeFigureCallback
-from sb3_ddiffpg.ddiffpg import DDiffPG
+from sb3_ddiffpg.ddiffpg import DDiffPG, DiffusionPolicy
 from sb3_ddiffpg.modes import Mode, ModeTable
-from sb3_ddiffpg.policies import DiffusionPolicy
+from sb3_ddiffpg.saving import _legacy
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "ClusteringCallback",
@@ -20,3 +20,5 @@ __all__ = [
     "ModeReplayBuffer",
     "ModeTable",
 ]
+
+_legacy.install()

@@ -1,6 +1,7 @@
 """Tiny environments, models and hand-made trajectories, shared by tests."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -10,27 +11,49 @@ from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 
 from sb3_ddiffpg import DDiffPG, ModeReplayBuffer
-from sb3_ddiffpg.rng import restore_generator
+from sb3_ddiffpg.exploration.bonus import ExplorationBonus
+from sb3_ddiffpg.serialization.random_states import restore_generator
 
 SMALL: dict[str, Any] = {
     "learning_starts": 40,
     "buffer_size": 2000,
     "batch_size": 32,
-    "min_mode_size": 3,
     "train_freq": 4,
     "recluster_freq": 5,
-    "distance_threshold": 0.5,
-    "exploration_fraction": 1.0,
     "seed": 0,
+    "modes": {"min_size": 3, "distance_threshold": 0.5},
+    "exploration": {"fraction": 1.0},
     "policy_kwargs": {"net_arch": [16]},
 }
+GROUPS = [kind.group for kind in DDiffPG.settings_groups]
+
+
+def merged(*arguments: dict[str, Any]) -> dict[str, Any]:
+    """Arguments, of which the later ones hold; of a group of settings, setting by setting."""
+    found: dict[str, Any] = {}
+    for each in arguments:
+        for name, value in each.items():
+            if name in GROUPS and not isinstance(value, dict):  # such as ``novelty="rnd"``
+                value = {"measure": value}
+            found[name] = {**found.get(name, {}), **value} if name in GROUPS else value
+    return found
 
 
 def small_model(env: Any, policy: str = "MlpPolicy", **changes: Any) -> DDiffPG:
     """A model that learns little, but fast, and writes no logs."""
-    model = DDiffPG(policy, env, **(SMALL | changes))
+    model = DDiffPG(policy, env, **merged(SMALL, changes))
     model.set_logger(Logger(None, []))
     return model
+
+
+def change_settings(model: Any, **groups: dict[str, Any]) -> None:
+    """Some settings are different from now on: for the model, and for its parts, which hold them too."""
+    for group, changes in groups.items():
+        attribute = f"{group.removesuffix('s')}_settings"
+        setattr(model, attribute, replace(getattr(model, attribute), **changes))
+    model.bonus.settings = model.novelty_settings
+    model.bonus.exploration = model.scheduler.settings = model.exploration_settings
+    model.mode_manager.settings = model.mode_settings
 
 
 class TwoEnds(gym.Env):
@@ -124,7 +147,7 @@ class BreaksAt(gym.Wrapper):
 
 
 # Random rewards are no reason to warn of returns outside the critics' support
-WIDE = {"v_min": -50.0, "v_max": 50.0}
+WIDE: dict[str, Any] = {"critic": {"v_min": -50.0, "v_max": 50.0}}
 
 
 def image_dict_space(channel_last: bool = False) -> spaces.Dict:
@@ -139,14 +162,25 @@ def image_dict_space(channel_last: bool = False) -> spaces.Dict:
     )
 
 
-def fill(buffer: ModeReplayBuffer, paths: Sequence[np.ndarray], success: bool = True, reward: float = 1.0) -> None:
-    """One environment walks along each path (an array [length + 1, dim]) and ends there, with the reward at the end."""
+def fill(
+    buffer: ModeReplayBuffer,
+    paths: Sequence[np.ndarray],
+    success: bool = True,
+    reward: float = 1.0,
+    bonus: ExplorationBonus | None = None,
+) -> None:
+    """
+    One environment walks along each path (an array [length + 1, dim]) and ends there, with the reward at the end. The bonus
+    sees each step, if there is one.
+    """
     for path in paths:
         for k in range(len(path) - 1):
             last = k == len(path) - 2
-            action = np.clip(path[k + 1] - path[k], -1, 1)[None, :2]
+            action = np.clip(path[k + 1] - path[k], -1, 1)[None, : buffer.action_dim]
             infos = [{"is_success": success and last}]
-            buffer.add(path[k][None], path[k + 1][None], action, np.array([reward * last]), np.array([last]), infos)
+            record = buffer.add(path[k][None], path[k + 1][None], action, np.array([reward * last]), np.array([last]), infos)
+            if bonus is not None:
+                bonus.observe(record, buffer)
 
 
 def some_observations(n: int = 10) -> np.ndarray:
@@ -182,7 +216,7 @@ def assert_same_state(first: dict[str, th.Tensor], second: dict[str, th.Tensor])
 def assert_no_gaps(buffer: ModeReplayBuffer) -> None:
     """Every trajectory of ``TwoEnds`` is one whole episode, the running ones included."""
     finished = [trajectory.rows for success in (True, False) for trajectory in buffer.trajectories(success)]
-    running = [rows[:length] for rows, length in zip(buffer._running, buffer._running_length, strict=True) if length]
+    running = [buffer.running.of(env) for env in np.flatnonzero(buffer.running.lengths).tolist()]
     for rows in (*finished, *running):
         np.testing.assert_array_equal(buffer.observations[rows[1:]], buffer.next_observations[rows[:-1]])
         assert buffer.observations[rows[0], 1] == 0.0  # the time within the episode

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch as th
-from environments import AnySpaces, fill, small_model
+from environments import AnySpaces, fill, merged, small_model
 from gymnasium import spaces
 from maze_routes import polyline
 
@@ -12,8 +12,8 @@ PLANE = spaces.Box(-20.0, 20.0, (2,))
 
 
 def planar_model(**changes):
-    settings = {"mode_features": [0, 1], "distance_threshold": 2.0, "mode_patience": 0, "buffer_size": 5000}
-    return small_model(AnySpaces(PLANE), **(settings | changes))
+    settings = {"mode_features": [0, 1], "buffer_size": 5000, "modes": {"distance_threshold": 2.0, "patience": 0}}
+    return small_model(AnySpaces(PLANE), **merged(settings, changes))
 
 
 def walk(model, route, n, success=True, part=1.0):
@@ -22,7 +22,7 @@ def walk(model, route, n, success=True, part=1.0):
     for _ in range(n):
         line = polyline(ROUTES[route], step=1.0) + rng.uniform(-0.3, 0.3, 2)
         line = line[: int(part * len(line))] + rng.normal(scale=0.1, size=(int(part * len(line)), 2))
-        fill(model.replay_buffer, [line.astype(np.float32)], success)
+        fill(model.replay_buffer, [line.astype(np.float32)], success, bonus=model.bonus)
 
 
 def said(model):

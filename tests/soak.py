@@ -15,7 +15,7 @@ import psutil
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_ddiffpg import DDiffPG
-from sb3_ddiffpg.checkpoints import RunCheckpointCallback
+from sb3_ddiffpg.callbacks.checkpoint import RunCheckpointCallback
 from sb3_ddiffpg.envs import make_vec_env
 
 N_SAMPLES, N_ENVS = 40, 64

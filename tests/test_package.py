@@ -63,7 +63,10 @@ def test_wheel_holds_every_file_of_the_package(wheel):
     expected = {path.relative_to(ROOT).as_posix() for path in (ROOT / "sb3_ddiffpg").rglob("*.py")}
     expected |= {f"sb3_ddiffpg/zoo_hyperparams/{path.name}" for path in (ROOT / "zoo_hyperparams").iterdir()}
     data = [ROOT / "sb3_ddiffpg" / "py.typed", ROOT / "sb3_ddiffpg" / "experiments" / "paper.yml"]
-    data += [*(ROOT / "sb3_ddiffpg" / "templates").iterdir(), *(ROOT / "sb3_ddiffpg" / "experiments" / "suites").iterdir()]
+    data += [
+        *(ROOT / "sb3_ddiffpg" / "visualization" / "templates").iterdir(),
+        *(ROOT / "sb3_ddiffpg" / "experiments" / "suites").iterdir(),
+    ]
     expected |= {path.relative_to(ROOT).as_posix() for path in data}
     assert {name for name in built if ".dist-info/" not in name} == expected
     assert any(name.endswith("LICENSE") for name in built)
@@ -140,9 +143,9 @@ importlib.import_module(module)
     ("extras", "module"),
     [
         ("", "sb3_ddiffpg"),
-        ("", "sb3_ddiffpg.checkpoints"),
+        ("", "sb3_ddiffpg.callbacks.checkpoint"),
         ("zoo", "sb3_ddiffpg.zoo"),
-        ("plots", "sb3_ddiffpg.plots"),
+        ("plots", "sb3_ddiffpg.visualization.plots"),
         ("plots", "sb3_ddiffpg.report"),
         ("zoo,plots", "sb3_ddiffpg.experiments.training"),
         ("zoo,plots", "sb3_ddiffpg.experiments.run"),

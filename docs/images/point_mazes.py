@@ -6,8 +6,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from sb3_ddiffpg.envs.drawing import draw_maze
-from sb3_ddiffpg.envs.mazes import MAZES, Maze, reduce_word
+from sb3_ddiffpg.envs.mazes.drawing import draw_maze
+from sb3_ddiffpg.envs.mazes.maze import MAZES, Maze, reduce_word
 
 
 def shortest_route(maze: Maze, label: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Pictures of DDiffPG's recorded runs: success of the commanded ways along training, and in a maze the first run's routes."""
+"""Pictures of DDiffPG's recorded runs: success of the routes by command in training, and in a maze the first run's paths."""
 
 from pathlib import Path
 
@@ -8,10 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from sb3_ddiffpg import DDiffPG, plots
+from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.episodes import run_episodes
+from sb3_ddiffpg.evaluation.rollout import run_episodes
 from sb3_ddiffpg.experiments.curve import REACHED
+from sb3_ddiffpg.visualization import plots
 
 RESULTS = Path(__file__).parents[2] / "results"
 N_EPISODES = 20
@@ -29,20 +30,20 @@ def recorded(env_id: str) -> list[Path]:
 
 def draw_curves(steps: Axes, hours: Axes, runs: list[Path]) -> None:
     """
-    :param steps: Gets the success against environment steps of each way that a command has taken in half of a test
+    :param steps: Gets the success against environment steps of each route that a command has taken in half of a test
     :param hours: The same against hours
     :param runs: Folders of recorded runs
     """
     curves = [pd.read_csv(run / "curve.csv") for run in runs]
-    ways = sorted({name.removeprefix(REACHED) for curve in curves for name in curve if name.startswith(REACHED)})
-    commanded = [way for way in ways if any(way in curve and (curve[way] >= LEAST_SUCCESS).any() for curve in curves)]
+    routes = sorted({name.removeprefix(REACHED) for curve in curves for name in curve if name.startswith(REACHED)})
+    commanded = [each for each in routes if any(each in curve and (curve[each] >= LEAST_SUCCESS).any() for curve in curves)]
     for number, (run, curve) in enumerate(zip(runs, curves, strict=True)):
-        for color, way in enumerate(commanded):
-            if way not in curve:
+        for color, route in enumerate(commanded):
+            if route not in curve:
                 continue
-            style = {"color": f"C{color}", "ls": ["-", "--", ":"][number % 3], "label": f"{way}, {run.name}"}
-            steps.plot(curve["step"], curve[way], **style)
-            hours.plot(curve["hours"], curve[way], **style)
+            style = {"color": f"C{color}", "ls": ["-", "--", ":"][number % 3], "label": f"{route}, {run.name}"}
+            steps.plot(curve["step"], curve[route], **style)
+            hours.plot(curve["hours"], curve[route], **style)
     steps.set(xlabel="environment steps", ylabel=f"success of {N_EPISODES}, best command")
     steps.xaxis.set_major_formatter(EngFormatter(sep=""))
     hours.set(xlabel="hours on one busy core")
@@ -55,16 +56,16 @@ def draw_ant(env_id: str) -> Figure:
     :return: The picture
     """
     figure = Figure(figsize=(14, 4.2), layout="constrained")
-    steps, hours, routes = figure.subplots(1, 3, width_ratios=(3, 3, 3.4))
+    steps, hours, paths = figure.subplots(1, 3, width_ratios=(3, 3, 3.4))
     runs = recorded(env_id)
     env = make_vec_env(env_id, N_EPISODES, seed=0, start_noise=0.0, integrator="euler")
     draw_curves(steps, hours, runs)
     model = DDiffPG.load(runs[0] / "model.zip")
     model.set_random_seed(0)
     episodes = {name: run_episodes(model, env, N_EPISODES, mode=name) for name in model.modes.names}
-    plots.draw_routes(routes, episodes, env.get_attr("maze")[0], plots.colors_of(list(model.modes)))
-    routes.set_title(f"{runs[0].name}: routes of {N_EPISODES} episodes each")
-    routes.legend(loc="lower left", fontsize=8)
+    plots.draw_routes(paths, episodes, env.get_attr("maze")[0], plots.colors_of(list(model.modes)))
+    paths.set_title(f"{runs[0].name}: paths of {N_EPISODES} episodes each")
+    paths.legend(loc="lower left", fontsize=8)
     return figure
 
 

@@ -1,15 +1,15 @@
 """The algorithms beside which DDiffPG stands, on the same critics, exploration bonus, buffer and denoiser."""
 
-from sb3_ddiffpg.actor_critic import NoveltyActorCritic
 from sb3_ddiffpg.baselines.consistency_ac import ConsistencyAC
 from sb3_ddiffpg.baselines.diffusion_ql import DiffusionQL
 from sb3_ddiffpg.baselines.dipo import DIPO
 from sb3_ddiffpg.baselines.rpg import RPG
 from sb3_ddiffpg.baselines.sac_c51 import SACC51
 from sb3_ddiffpg.baselines.td3_c51 import TD3C51
+from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm
 
 #: By their names in the zoo
-BASELINES: dict[str, type[NoveltyActorCritic]] = {
+BASELINES: dict[str, type[ActorCriticAlgorithm]] = {
     "consistency_ac": ConsistencyAC,
     "diffusion_ql": DiffusionQL,
     "dipo": DIPO,

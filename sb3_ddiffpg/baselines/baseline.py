@@ -1,24 +1,31 @@
 """What the baselines share: one group of critics, a first-in-first-out buffer, and a target actor for those that have one."""
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
-from sb3_ddiffpg.actor_critic import NoveltyActorCritic
-from sb3_ddiffpg.buffers import ModeBatch, ModeReplayBuffer
-from sb3_ddiffpg.policy_parts import average_networks
-from sb3_ddiffpg.trajectories import Trajectory
-from sb3_ddiffpg.twin_critic_policy import Actor, TwinCriticPolicy
+from sb3_ddiffpg.buffers.batch import ModeBatch
+from sb3_ddiffpg.buffers.mode_buffer import ModeReplayBuffer
+from sb3_ddiffpg.buffers.trajectory import Trajectory
+from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm, Metrics
+from sb3_ddiffpg.networks.policies import Actor, TwinCriticPolicy, average_networks
+from sb3_ddiffpg.serialization.codec import registered
+from sb3_ddiffpg.utils.settings import SHARE, Accepted
 
 
+@registered("sb3_ddiffpg.baselines.baseline.FifoReplayBuffer")
 class FifoReplayBuffer(ModeReplayBuffer):
-    """A ``ModeReplayBuffer`` without modes: the trajectory that ended first is the first to go."""
+    """A ``ModeReplayBuffer`` without modes and target actions: the trajectory that ended first is the first to go."""
+
+    target_action_fields: tuple[str, ...] = ()
 
     def _insert(self, trajectory: Trajectory) -> None:
-        self._retired.append(trajectory)
+        self.groups.retired.append(trajectory)
 
 
 class BaselinePolicy(TwinCriticPolicy):
@@ -72,16 +79,17 @@ def names_of(policy_class: type[BasePolicy]) -> dict[str, type[BasePolicy]]:
     return dict.fromkeys(("MlpPolicy", "MultiInputPolicy"), policy_class)
 
 
-class Baseline(NoveltyActorCritic):
+class Baseline(ActorCriticAlgorithm):
     """
     :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param actor_tau: Soft update coefficient of a target actor, which acts in the Bellman target; None: the actor itself does
-    :param kwargs: Of ``NoveltyActorCritic``
+    :param kwargs: Of ``ActorCriticAlgorithm``
     """
 
     default_replay_buffer_class = FifoReplayBuffer
-    target_networks: ClassVar[dict[str, str]] = {**NoveltyActorCritic.target_networks, "actor_target": "actor"}
+    accepted: ClassVar[dict[str, Accepted]] = {"actor_tau": SHARE.or_none()}
+    target_networks: ClassVar[dict[str, str]] = {**ActorCriticAlgorithm.target_networks, "actor_target": "actor"}
     policy: BaselinePolicy
 
     def __init__(self, policy: str | type[BasePolicy], env: Any, *, actor_tau: float | None = None, **kwargs: Any) -> None:
@@ -99,8 +107,10 @@ class Baseline(NoveltyActorCritic):
         if self.actor_tau is not None:
             self._average_actor(self.actor_tau)
 
-    def _end_updates(self, gradient_steps: int, metrics: dict[str, list[th.Tensor]]) -> None:
-        super()._end_updates(gradient_steps, metrics)
+    @contextmanager
+    def _updates(self, gradient_steps: int) -> Iterator[Metrics]:
+        with super()._updates(gradient_steps) as metrics:
+            yield metrics
         if self.actor_tau is None:  # it may be given when the model goes on
             average_networks([self.actor], [self.policy.actor_target], 1.0)
 

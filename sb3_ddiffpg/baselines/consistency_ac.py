@@ -11,9 +11,11 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, names_of
-from sb3_ddiffpg.buffers import ModeBatch
-from sb3_ddiffpg.diffusion import Denoiser
-from sb3_ddiffpg.twin_critic_policy import Actor
+from sb3_ddiffpg.buffers.batch import ModeBatch
+from sb3_ddiffpg.common.actor_critic import Metrics
+from sb3_ddiffpg.networks.diffusion import Denoiser
+from sb3_ddiffpg.networks.policies import Actor
+from sb3_ddiffpg.utils.settings import NOT_NEGATIVE, Accepted, at_least, is_integer
 
 SIGMA_DATA, SIGMA_MIN, SIGMA_MAX = 0.5, 0.002, 80.0
 RHO = 7.0
@@ -133,10 +135,23 @@ class ConsistencyAC(Baseline):
     :param consistency_coef: Factor of the consistency loss
     :param n_levels: Noise levels of the consistency loss at the beginning of the training, and one less than at its end
     :param actor_tau: Soft update coefficient of the target actor
-    :param kwargs: Of ``Baseline`` and ``NoveltyActorCritic``
+    :param kwargs: Of ``Baseline`` and ``ActorCriticAlgorithm``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(ConsistencyActorPolicy)
+    accepted: ClassVar[dict[str, Accepted]] = {
+        "n_diffusion_steps": at_least(1),
+        "consistency_coef": NOT_NEGATIVE,
+        "n_levels": Accepted(
+            "be two integers, of at least 2, in order",
+            lambda value: (
+                isinstance(value, (list, tuple))
+                and len(value) == 2
+                and all(map(is_integer, value))
+                and 2 <= value[0] <= value[1]
+            ),
+        ),
+    }
 
     def __init__(
         self,
@@ -157,7 +172,7 @@ class ConsistencyAC(Baseline):
     def _policy_arguments(self) -> dict[str, Any]:
         return {**super()._policy_arguments(), "n_diffusion_steps": self.n_diffusion_steps}
 
-    def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
+    def _update_actor(self, batch: ModeBatch, metrics: Metrics) -> None:
         values = self._values(batch, self.actor(batch.observations))
         loss = -values.min(dim=0).values.mean()
         if self.consistency_coef:

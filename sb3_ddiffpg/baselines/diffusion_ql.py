@@ -8,8 +8,11 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_ddiffpg.baselines.baseline import Baseline, names_of
 from sb3_ddiffpg.baselines.dipo import DiffusionActorPolicy
-from sb3_ddiffpg.buffers import ModeBatch
-from sb3_ddiffpg.safe_files import Count
+from sb3_ddiffpg.buffers.batch import ModeBatch
+from sb3_ddiffpg.common.actor_critic import Metrics
+from sb3_ddiffpg.serialization.safetensors_tree import Count
+from sb3_ddiffpg.utils.observations import repeated
+from sb3_ddiffpg.utils.settings import NOT_NEGATIVE, Accepted, at_least
 
 
 class DiffusionQL(Baseline):
@@ -29,11 +32,16 @@ class DiffusionQL(Baseline):
     :param average_freq: Updates between two steps of the target actor (with ``actor_tau``)
     :param average_start: Updates before the first of them
     :param actor_tau: Soft update coefficient of the target actor
-    :param kwargs: Of ``Baseline`` and ``NoveltyActorCritic``
+    :param kwargs: Of ``Baseline`` and ``ActorCriticAlgorithm``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(DiffusionActorPolicy)
     target_networks: ClassVar[dict[str, str]] = {"actor_target": "actor"}  # it acts by the target critics
+    accepted: ClassVar[dict[str, Accepted]] = {
+        **dict.fromkeys(("n_diffusion_steps", "n_candidates", "average_freq"), at_least(1)),
+        **dict.fromkeys(("q_coef", "bc_coef"), NOT_NEGATIVE),
+        "average_start": at_least(0),
+    }
     _counters: ClassVar[dict[str, Any]] = {"_n_actor_updates": Count}
 
     def __init__(
@@ -65,11 +73,11 @@ class DiffusionQL(Baseline):
         steps = {"n_diffusion_steps": self.n_diffusion_steps, "noise_schedule": self.noise_schedule}
         return {**super()._policy_arguments(), **steps}
 
-    def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
+    def _update_actor(self, batch: ModeBatch, metrics: Metrics) -> None:
         condition = self.actor.condition(batch.observations)
         actions = self.actor.diffusion.denoise(condition)
         values = self._values(batch, actions)
-        first, second = np.random.permutation(self.n_critics)[[0, -1]]
+        first, second = np.random.permutation(self.critic_settings.n_critics)[[0, -1]]
         loss = -self.q_coef * values[first].mean() / (values[second].abs().mean().detach() + 1e-6)
         if self.bc_coef:
             loss = loss + self.bc_coef * self.actor.diffusion.loss(batch.actions[0], condition)
@@ -113,11 +121,7 @@ class DiffusionQL(Baseline):
     def _one_of_many(self, obs: Any) -> th.Tensor:
         """For each of N observations one of its candidates, drawn by the softmax of their values, [N, action_dim]."""
         n = self.n_candidates
-        tiled = (
-            {key: value.repeat_interleave(n, 0) for key, value in obs.items()}
-            if isinstance(obs, dict)
-            else obs.repeat_interleave(n, 0)
-        )
+        tiled = repeated(obs, n)
         actions = self.actor(tiled)
         critics = self.policy.critics_target
         features = self.policy.critic_features(tiled, target=True)

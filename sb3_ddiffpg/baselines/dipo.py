@@ -1,17 +1,20 @@
 """DIPO: a diffusion policy that imitates actions which climb the critic."""
 
-from functools import partial
 from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
-from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, names_of
-from sb3_ddiffpg.buffers import ModeBatch
-from sb3_ddiffpg.cuda_graphs import GraphedFunction
-from sb3_ddiffpg.policies import DiffusionActor
-from sb3_ddiffpg.target_actions import ascend
+from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, FifoReplayBuffer, names_of
+from sb3_ddiffpg.buffers.batch import ModeBatch
+from sb3_ddiffpg.common.actor_critic import Metrics
+from sb3_ddiffpg.networks.cuda_graphs import graphed
+from sb3_ddiffpg.networks.diffusion import DiffusionActor
+from sb3_ddiffpg.networks.settings import TargetActionSettings
+from sb3_ddiffpg.networks.target_actions import climb
+from sb3_ddiffpg.serialization.codec import registered
+from sb3_ddiffpg.utils.settings import FLAG, POSITIVE_OR_INFINITE, Accepted, Settings, at_least
 
 
 class DiffusionActorPolicy(BaselinePolicy):
@@ -56,6 +59,13 @@ class DiffusionActorPolicy(BaselinePolicy):
         self._constructor.update(actor_kwargs)
 
 
+@registered("sb3_ddiffpg.baselines.dipo.TargetActionReplayBuffer")
+class TargetActionReplayBuffer(FifoReplayBuffer):
+    """A ``FifoReplayBuffer`` with one target action beside each action."""
+
+    target_action_fields = ("exploratory_target_actions",)
+
+
 class DIPO(Baseline):
     """
     Diffusion policy for model-free online reinforcement learning (Yang et al., 2023, https://arxiv.org/abs/2305.13122): target
@@ -63,21 +73,27 @@ class DIPO(Baseline):
 
     The defaults are those of the DDiffPG paper's comparison (5 steps, one batch for critic and policy, no target actor) with
     DDiffPG's ascent. The original: ``n_diffusion_steps=100, actor_tau=0.005, own_policy_batch=True, total_gradient_ratio=0.3,
-    n_action_gradient_steps=20, action_lr=0.03``.
+    target_action=dict(n_steps=20, learning_rate=0.03)``.
 
     :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param n_diffusion_steps: Number of diffusion steps T
-    :param action_lr: Step size of the ascent on target actions
-    :param n_action_gradient_steps: Number of ascent steps K per update
-    :param action_optimizer: See ``target_actions.ascend``
+    :param target_action: How target actions climb the critics, see ``TargetActionSettings``
     :param total_gradient_ratio: Largest norm of a whole batch's gradient, as a multiple of the action's size; None: no limit.
         With "adam", whose steps hardly depend on the gradient's size, it changes little, in the original too
     :param own_policy_batch: Whether the policy learns from a batch of its own
-    :param kwargs: Of ``Baseline`` and ``NoveltyActorCritic``
+    :param kwargs: Of ``Baseline`` and ``ActorCriticAlgorithm``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(DiffusionActorPolicy)
+    default_replay_buffer_class = TargetActionReplayBuffer
+    settings_groups: ClassVar[tuple[type[Settings], ...]] = (*Baseline.settings_groups, TargetActionSettings)
+    accepted: ClassVar[dict[str, Accepted]] = {
+        "n_diffusion_steps": at_least(1),
+        "total_gradient_ratio": POSITIVE_OR_INFINITE.or_none(),
+        "own_policy_batch": FLAG,
+    }
+    target_action_settings: TargetActionSettings
 
     def __init__(
         self,
@@ -85,29 +101,28 @@ class DIPO(Baseline):
         env: Any,
         *,
         n_diffusion_steps: int = 5,
-        action_lr: float = 0.3,
-        n_action_gradient_steps: int = 1,
-        action_optimizer: str = "adam",
         total_gradient_ratio: float | None = None,
         own_policy_batch: bool = False,
         **kwargs: Any,
     ) -> None:
         self.n_diffusion_steps = n_diffusion_steps
-        self.action_lr = action_lr
-        self.n_action_gradient_steps = n_action_gradient_steps
-        self.action_optimizer = action_optimizer
         self.total_gradient_ratio = total_gradient_ratio
         self.own_policy_batch = own_policy_batch
         super().__init__(policy, env, **kwargs)
+
+    def _setup_model(self) -> None:
+        if self.replay_buffer_class is FifoReplayBuffer:  # of a file of version 0.1, when that one had target actions
+            self.replay_buffer_class = None
+        super()._setup_model()
 
     def _policy_arguments(self) -> dict[str, Any]:
         return {**super()._policy_arguments(), "n_diffusion_steps": self.n_diffusion_steps}
 
     def _create_aliases(self) -> None:
         super()._create_aliases()
-        self.graphs["ascent"] = GraphedFunction(self._ascend, self.policy)
+        self.graphs["ascent"] = graphed(self._climb, self.policy)
 
-    def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
+    def _update_actor(self, batch: ModeBatch, metrics: Metrics) -> None:
         if self.own_policy_batch:
             batch = self.replay_buffer.sample_modes(batch.rows.size, self.gamma, 1, 1, env=self._vec_normalize_env)
         improved = self._improve_target_actions(batch)
@@ -115,16 +130,7 @@ class DIPO(Baseline):
         condition = self.actor.condition(batch.observations)
         metrics["actor_loss"].append(self._step_actor(self.actor.diffusion.loss(improved.flatten(0, 1), condition)))
 
-    def _ascend(self, batch: ModeBatch) -> th.Tensor:
-        with th.no_grad():
-            features = self.policy.critic_features(batch.observations)
-        gradient = self.policy.critics.action_gradient(features)
-        if self.total_gradient_ratio is not None:
-            limit = self.total_gradient_ratio * batch.actions.shape[-1]
-            gradient = partial(_limited, gradient, limit)
-        return ascend(gradient, batch.target_actions, self.action_lr, self.n_action_gradient_steps, self.action_optimizer)
-
-
-def _limited(gradient: Any, limit: float, actions: th.Tensor) -> th.Tensor:
-    found = gradient(actions)
-    return found * (limit / (found.norm() + 1e-8)).clamp(max=1.0)
+    def _climb(self, batch: ModeBatch) -> th.Tensor:
+        ratio = self.total_gradient_ratio
+        limit = None if ratio is None else ratio * batch.actions.shape[-1]
+        return climb(self.policy, batch, self.target_action_settings, limit)

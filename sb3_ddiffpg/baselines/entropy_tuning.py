@@ -1,15 +1,16 @@
 """The factor of a policy's entropy, tuned so that the entropy comes to what it should be (Haarnoja et al., 2018)."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_ddiffpg.actor_critic import NoveltyActorCritic
+from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm, Metrics
+from sb3_ddiffpg.utils.settings import NOT_NEGATIVE, NUMBER, Accepted
 
 
-class EntropyTuning(NoveltyActorCritic):
+class EntropyTuning(ActorCriticAlgorithm):
     """
     An algorithm whose policy has a ``log_entropy_coef``. Its own noise explores: there is no other unless ``action_noise`` is
     given.
@@ -21,6 +22,11 @@ class EntropyTuning(NoveltyActorCritic):
     :param target_entropy: Entropy that it aims at; None: minus the action's size
     :param kwargs: Of the class behind this one
     """
+
+    accepted: ClassVar[dict[str, Accepted]] = {
+        **dict.fromkeys(("entropy_learning_rate", "initial_entropy_coef"), NOT_NEGATIVE),
+        "target_entropy": NUMBER.or_none(),
+    }
 
     def __init__(
         self,
@@ -55,7 +61,7 @@ class EntropyTuning(NoveltyActorCritic):
         """The factor alpha of the entropy, a scalar."""
         return self._log_entropy_coef.detach().exp()
 
-    def _tune_entropy(self, log_probabilities: th.Tensor, metrics: dict[str, list[th.Tensor]]) -> None:
+    def _tune_entropy(self, log_probabilities: th.Tensor, metrics: Metrics) -> None:
         """
         One step of the factor's logarithm.
 

@@ -1,5 +1,6 @@
 """SAC with distributional critics."""
 
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch as th
@@ -13,8 +14,12 @@ from torch import nn
 
 from sb3_ddiffpg.baselines.baseline import Baseline, MlpActorPolicy, names_of
 from sb3_ddiffpg.baselines.entropy_tuning import EntropyTuning
-from sb3_ddiffpg.buffers import ModeBatch
-from sb3_ddiffpg.twin_critic_policy import Actor
+from sb3_ddiffpg.buffers.batch import ModeBatch
+from sb3_ddiffpg.common.actor_critic import Metrics
+from sb3_ddiffpg.exploration.settings import NoveltySettings
+from sb3_ddiffpg.networks.policies import Actor
+from sb3_ddiffpg.networks.settings import CriticSettings
+from sb3_ddiffpg.utils.settings import NOT_NEGATIVE, Settings, setting
 
 LOG_STD_RANGE = (-5.0, 5.0)
 
@@ -84,6 +89,13 @@ class GaussianActorPolicy(MlpActorPolicy):
         self.log_entropy_coef = nn.Parameter(th.zeros(()))
 
 
+@dataclass(frozen=True, kw_only=True)
+class SACCriticSettings(CriticSettings):
+    """``CriticSettings``, but for the default of the noise in the target: SAC's policy has its own."""
+
+    target_policy_noise: float = setting(0.0, NOT_NEGATIVE, flat="target_policy_noise")
+
+
 class SACC51(EntropyTuning, Baseline):
     """
     SAC (Haarnoja et al., 2018, https://arxiv.org/abs/1812.05905) with C51 critics and NovelD; the entropy is part of the
@@ -93,12 +105,12 @@ class SACC51(EntropyTuning, Baseline):
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param entropy_learning_rate: As in ``EntropyTuning``
     :param initial_entropy_coef: As there
-    :param target_policy_noise: As in ``NoveltyActorCritic``
-    :param kwargs: Of ``EntropyTuning``, ``Baseline`` and ``NoveltyActorCritic``
+    :param kwargs: Of ``EntropyTuning``, ``Baseline`` and ``ActorCriticAlgorithm``
     """
 
     policy: GaussianActorPolicy
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(GaussianActorPolicy)
+    settings_groups: ClassVar[tuple[type[Settings], ...]] = (SACCriticSettings, NoveltySettings)
 
     def __init__(
         self,
@@ -107,7 +119,6 @@ class SACC51(EntropyTuning, Baseline):
         *,
         entropy_learning_rate: float = 5e-3,
         initial_entropy_coef: float = 1.0,
-        target_policy_noise: float = 0.0,
         **kwargs: Any,
     ) -> None:
         super().__init__(
@@ -115,7 +126,6 @@ class SACC51(EntropyTuning, Baseline):
             env,
             entropy_learning_rate=entropy_learning_rate,
             initial_entropy_coef=initial_entropy_coef,
-            target_policy_noise=target_policy_noise,
             **kwargs,
         )
 
@@ -123,7 +133,7 @@ class SACC51(EntropyTuning, Baseline):
         actions, log_probabilities = self._target_actor().sample(batch.next_observations)
         return actions, -self.entropy_coef * log_probabilities[None]
 
-    def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
+    def _update_actor(self, batch: ModeBatch, metrics: Metrics) -> None:
         actions, log_probabilities = self.actor.sample(batch.observations)
         values = self._values(batch, actions).min(dim=0).values
         metrics["actor_loss"].append(self._step_actor((self.entropy_coef * log_probabilities - values).mean()))

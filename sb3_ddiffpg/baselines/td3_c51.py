@@ -11,9 +11,11 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_ddiffpg.baselines.baseline import Baseline, MlpActorPolicy, names_of
-from sb3_ddiffpg.buffers import ModeBatch
-from sb3_ddiffpg.safe_files import Count
-from sb3_ddiffpg.twin_critic_policy import Actor
+from sb3_ddiffpg.buffers.batch import ModeBatch
+from sb3_ddiffpg.common.actor_critic import Metrics
+from sb3_ddiffpg.networks.policies import Actor
+from sb3_ddiffpg.serialization.safetensors_tree import Count
+from sb3_ddiffpg.utils.settings import Accepted, at_least
 
 
 class TanhActor(Actor):
@@ -66,10 +68,11 @@ class TD3C51(Baseline):
     :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param policy_delay: Updates of the critics for each of the actor and of the target networks
-    :param kwargs: Of ``Baseline`` and ``NoveltyActorCritic``
+    :param kwargs: Of ``Baseline`` and ``ActorCriticAlgorithm``
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(TanhActorPolicy)
+    accepted: ClassVar[dict[str, Accepted]] = {"policy_delay": at_least(1)}
     _counters: ClassVar[dict[str, Any]] = {"_n_critic_updates": Count}
 
     def __init__(self, policy: str | type[BasePolicy], env: Any, *, policy_delay: int = 1, **kwargs: Any) -> None:
@@ -77,7 +80,7 @@ class TD3C51(Baseline):
         self._n_critic_updates = 0
         super().__init__(policy, env, **kwargs)
 
-    def _update_actor(self, batch: ModeBatch, metrics: dict[str, list[th.Tensor]]) -> None:
+    def _update_actor(self, batch: ModeBatch, metrics: Metrics) -> None:
         self._n_critic_updates += 1
         if self._policy_is_due():
             values = self._values(batch, self.actor(batch.observations))

@@ -6,7 +6,7 @@ import torch as th
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from torch import nn
 
-from sb3_ddiffpg.critics import ModeCritics
+from sb3_ddiffpg.networks.critics import ModeCritics
 
 
 class WorldModel(nn.Module):

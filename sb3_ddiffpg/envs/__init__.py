@@ -1,4 +1,4 @@
-"""Environments with several ways to the goal. Importing this module registers them with gymnasium."""
+"""Environments with several routes to the goal. Importing this module registers them with gymnasium."""
 
 from dataclasses import replace
 from functools import partial
@@ -10,11 +10,11 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 from stable_baselines3.common.env_util import make_vec_env as make_sb3_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from sb3_ddiffpg.envs.homotopy import HomotopyTracker
-from sb3_ddiffpg.envs.mazes import LISTED_ROUTES, MAZES, Maze, reduce_word
-from sb3_ddiffpg.envs.point import PointMazeEnv, PointMazeVecEnv
-from sb3_ddiffpg.envs.turns import TurnVecEnv
-from sb3_ddiffpg.envs.workers import WorkerVecEnv
+from sb3_ddiffpg.envs.mazes.homotopy import HomotopyTracker
+from sb3_ddiffpg.envs.mazes.maze import LISTED_ROUTES, MAZES, Maze, reduce_word
+from sb3_ddiffpg.envs.mazes.point import PointMazeEnv, PointMazeVecEnv
+from sb3_ddiffpg.envs.vec_env.tracing import TracingDummyVecEnv
+from sb3_ddiffpg.envs.vec_env.workers import WorkerVecEnv
 from sb3_ddiffpg.envs.wrappers import HideGoal
 
 __all__ = [
@@ -32,8 +32,8 @@ __all__ = [
 
 # Single environment -> the class that steps many of them together. Strings, so that simulators are imported when needed
 _VEC_ENVS = {
-    "sb3_ddiffpg.envs.point:PointMazeEnv": "sb3_ddiffpg.envs.point:PointMazeVecEnv",
-    "sb3_ddiffpg.envs.ant:AntMazeEnv": "sb3_ddiffpg.envs.ant:AntMazeVecEnv",
+    "sb3_ddiffpg.envs.mazes.point:PointMazeEnv": "sb3_ddiffpg.envs.mazes.point:PointMazeVecEnv",
+    "sb3_ddiffpg.envs.mazes.ant:AntMazeEnv": "sb3_ddiffpg.envs.mazes.ant:AntMazeVecEnv",
 }
 _POINT_MAZE, _ANT_MAZE = _VEC_ENVS
 
@@ -70,8 +70,8 @@ def make_vec_env(
     """
     Many environments as SB3 wants them: in one process, with ``info["episode"]`` at the end of each episode.
 
-    The mazes are stepped together as a :class:`~sb3_ddiffpg.envs.maze_env.MazeVecEnv`, the arm's tasks in a few processes
-    (:class:`~sb3_ddiffpg.envs.workers.WorkerVecEnv`); for every other id this is SB3's ``make_vec_env``. All give the numbers
+    The mazes are stepped together as a :class:`~sb3_ddiffpg.envs.mazes.env.MazeVecEnv`, the arm's tasks in a few processes
+    (:class:`~sb3_ddiffpg.envs.vec_env.WorkerVecEnv`); for every other id this is SB3's ``make_vec_env``. All give the numbers
     of environments that are stepped one after the other.
 
     :param env_id: id of a registered environment, perhaps with the module that registers it: ``"module:id"``
@@ -87,13 +87,13 @@ def make_vec_env(
     if str(spec.entry_point).startswith(_FRANKA):
         # The spec, not the id: the workers do not know what was registered here
         makers: list[Any] = [partial(gym.make, spec, **env_kwargs)] * n_envs
-        workers: VecEnv = WorkerVecEnv(makers, n_threads) if n_envs > 1 else TurnVecEnv(makers)
+        workers: VecEnv = WorkerVecEnv(makers, n_threads) if n_envs > 1 else TracingDummyVecEnv(makers)
         if seed is not None:
             workers.action_space.seed(seed)
         workers.seed(seed)
         return VecMonitor(workers)
     if spec.entry_point not in _VEC_ENVS:
-        return make_sb3_vec_env(env_id, n_envs, seed=seed, env_kwargs=env_kwargs, vec_env_cls=TurnVecEnv)
+        return make_sb3_vec_env(env_id, n_envs, seed=seed, env_kwargs=env_kwargs, vec_env_cls=TracingDummyVecEnv)
     limit = env_kwargs.pop("max_episode_steps", None) or spec.max_episode_steps
     kwargs = {"render_mode": "rgb_array", **spec.kwargs, **env_kwargs}
     threads = {} if n_threads is None or spec.entry_point == _POINT_MAZE else {"n_threads": n_threads}

@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
-from sb3_ddiffpg.divergence import LARGEST
-from sb3_ddiffpg.safe_files import Count, check_array, convert
+from sb3_ddiffpg.serialization.safetensors_tree import Count, check_array, convert
+from sb3_ddiffpg.utils.divergence import LARGEST
 
 
 def _plain(kind: type) -> type:
@@ -210,6 +210,26 @@ def restore_normalization(env: VecNormalize, tree: Any) -> None:
             raise ValueError("normalization: there are numbers that no observations have")
     for target, saved in pairs:
         target.mean, target.var, target.count = saved.mean.copy(), saved.var.copy(), saved.count
+
+
+class SoundNormalization:
+    """What VecNormalize knew when all was well, which it gets back after it was given what is not finite."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, Any] | None = None
+
+    def note(self, env: VecNormalize | None) -> None:
+        """
+        :param env: All is well; None: nothing is normalised
+        """
+        self._known = None if env is None else normalization(env)
+
+    def restore(self, env: VecNormalize | None) -> None:
+        """
+        :param env: Gets it back
+        """
+        if env is not None and self._known is not None:
+            restore_normalization(env, self._known)
 
 
 def _of_observations(env: VecNormalize) -> dict[str, RunningMeanStd]:

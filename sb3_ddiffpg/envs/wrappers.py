@@ -8,7 +8,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_ddiffpg.envs.mazes import cell_distances
+from sb3_ddiffpg.envs.mazes.maze import cell_distances
 
 Observation = npt.NDArray[np.float32]
 

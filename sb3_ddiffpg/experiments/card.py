@@ -8,9 +8,10 @@ from typing import Any
 
 import yaml
 
-from sb3_ddiffpg.actor_critic import NoveltyActorCritic
+from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm
+from sb3_ddiffpg.experiments.ablations import register
 from sb3_ddiffpg.experiments.store import Recorded, read_training
-from sb3_ddiffpg.zoo import ALGOS, register
+from sb3_ddiffpg.zoo import ALGOS
 
 try:
     from huggingface_hub import EvalResult, HfApi, ModelCard, ModelCardData
@@ -20,7 +21,7 @@ except ImportError as error:
         f"the Hugging Face hub is an extra ({error}); install it with: pip install 'sb3_ddiffpg[hub]'"
     ) from error
 
-TEMPLATE = Path(__file__).parents[1] / "templates" / "model_card.md"
+TEMPLATE = Path(__file__).parents[1] / "visualization" / "templates" / "model_card.md"
 #: The model without code
 SAFE_MODEL = "model.safetensors"
 
@@ -34,7 +35,7 @@ def write_card(folder: Path, repo_id: str) -> Path:
     run = _read(folder)
     found = run.evaluation
     model = ALGOS[run.trial.algo].load(folder / "model.zip")
-    if isinstance(model, NoveltyActorCritic):
+    if isinstance(model, ActorCriticAlgorithm):
         model.export(folder / SAFE_MODEL)
     data = ModelCardData(
         model_name=f"{run.trial.algo} in {run.trial.env}",
@@ -67,7 +68,7 @@ def write_card(folder: Path, repo_id: str) -> Path:
         repo_id=repo_id,
         evaluation=str(found),
         modes=[each.mode for each in found.commanded],
-        safe=isinstance(model, NoveltyActorCritic),
+        safe=isinstance(model, ActorCriticAlgorithm),
         settings=yaml.safe_dump(run.trial.hyperparams, sort_keys=False).strip(),
         record=run.record,
     )

@@ -10,13 +10,13 @@ from typing import Any
 
 import psutil
 
-from sb3_ddiffpg.callbacks import EvaluateModesCallback
+from sb3_ddiffpg.buffers.success import read_success
+from sb3_ddiffpg.callbacks.evaluation import EvaluateModesCallback
+from sb3_ddiffpg.evaluation.results import ModeEvaluation
 from sb3_ddiffpg.experiments.wall_clock import Stopwatch
-from sb3_ddiffpg.mode_evaluation import ModeEvaluation
-from sb3_ddiffpg.safe_files import convert
-from sb3_ddiffpg.trajectories import read_success
+from sb3_ddiffpg.serialization.safetensors_tree import convert
 
-#: Column of the goals reached in training by a way, before its label
+#: Column of the goals reached in training by a route, before its label
 REACHED = "reached "
 
 
@@ -61,7 +61,7 @@ class CurveCallback(EvaluateModesCallback):
     def __init__(self, folder: Path, **kwargs: Any) -> None:
         super().__init__(path=folder / "logs" / "evaluations.jsonl", best_model_path=folder / "model.zip", **kwargs)
         self.folder = folder
-        #: Goals reached in training, by the environment's label of the way
+        #: Goals reached in training, by the environment's label of the route
         self.reached: Counter[str] = Counter()
         self.rows: list[dict[str, Any]] = []
         self.clock = Clock()
@@ -103,7 +103,7 @@ class CurveCallback(EvaluateModesCallback):
             writer.writerows(self.rows)
 
     def _labels(self, found: ModeEvaluation) -> list[str]:
-        """Of the ways that are listed, and of those that a test has taken, this one or one before."""
+        """Of the routes that are listed, and of those that a test has taken, this one or one before."""
         before = [name.removeprefix(REACHED) for name in (self.rows or [{}])[-1] if name.startswith(REACHED)]
         told = found.label_source == "environment"  # those of a clustering mean something else in each test
         taken = sorted({label for each in (*found.commanded, found.uncommanded) for label in each.labels}) if told else []

@@ -9,12 +9,13 @@ import seaborn as sns
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from sb3_ddiffpg import plots
-from sb3_ddiffpg.actor_critic import NoveltyActorCritic
+from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.experiments.store import Recorded, by, task_of, variant_of
 from sb3_ddiffpg.experiments.summary import MEASURES, over_tasks, seconds_per_update
+from sb3_ddiffpg.experiments.trial import setting_of
 from sb3_ddiffpg.experiments.wall_clock import PARTS
+from sb3_ddiffpg.visualization import plots
 from sb3_ddiffpg.zoo import ALGOS
 
 # Places on the horizontal axis, to which every training's tests are interpolated
@@ -118,7 +119,7 @@ def ablation(runs: Sequence[Recorded], setting: str) -> Figure:
     measures = ("success", "modes in 20")
     figure, panels = plots.panels(len(measures))
     for axes, measure in zip(panels, measures, strict=True):
-        rows = [(run.trial.hyperparams[setting], MEASURES[measure](run.evaluation), task_of(run)) for run in runs]
+        rows = [(setting_of(run.trial, setting), MEASURES[measure](run.evaluation), task_of(run)) for run in runs]
         data = pd.DataFrame(rows, columns=[setting, measure, "task"])
         sns.lineplot(data, x=setting, y=measure, hue="task", marker="o", ax=axes, errorbar=("pi", 100))
         values = sorted(data[setting].unique())
@@ -162,7 +163,7 @@ class Maps:
         shown = {
             variant: run
             for variant, run in firsts.items()
-            if (run.folder / "model.zip").is_file() and issubclass(ALGOS[run.trial.algo], NoveltyActorCritic)
+            if (run.folder / "model.zip").is_file() and issubclass(ALGOS[run.trial.algo], ActorCriticAlgorithm)
         }
         self.models: dict[str, Any] = {
             variant: ALGOS[run.trial.algo].load(_final_model(run)) for variant, run in shown.items()

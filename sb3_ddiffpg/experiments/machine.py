@@ -1,18 +1,13 @@
 """Where and with what a training ran."""
 
-import os
 import platform
 import subprocess
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import torch as th
 
-PACKAGES = (
-    *("sb3_ddiffpg", "stable_baselines3", "rl_zoo3", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "pybullet"),
-    *("numpy", "scipy", "numba"),
-)
+from sb3_ddiffpg.utils.processors import n_processors
 
 
 def git_commit() -> str | None:
@@ -39,7 +34,7 @@ def machine() -> dict[str, Any]:
     return {
         "system": f"{platform.system()} {platform.machine()}",
         "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": n_processors(),
         "torch_threads": th.get_num_threads(),
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
     }
@@ -51,16 +46,3 @@ def _processor() -> str:
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor()
-
-
-def versions() -> dict[str, str]:
-    """
-    :return: Of Python and the packages that decide on a result
-    """
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found

@@ -10,8 +10,9 @@ from typing import Any
 import msgspec
 import yaml
 
-from sb3_ddiffpg.experiments.machine import git_commit, machine, versions
+from sb3_ddiffpg.experiments.machine import git_commit, machine
 from sb3_ddiffpg.experiments.trial import Trial
+from sb3_ddiffpg.utils.versions import versions
 
 _FILE = "config.yml"
 

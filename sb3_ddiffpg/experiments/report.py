@@ -18,11 +18,12 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sb3_ddiffpg.experiments import figures
+from sb3_ddiffpg.experiments.ablations import register
 from sb3_ddiffpg.experiments.files import check_output, task_file_name
 from sb3_ddiffpg.experiments.record import command_line
 from sb3_ddiffpg.experiments.store import Recorded, by, check_alike, read_results, task_of, variant_of
 from sb3_ddiffpg.experiments.summary import elsewhere_table, seconds_per_update, task_table
-from sb3_ddiffpg.zoo import register
+from sb3_ddiffpg.experiments.trial import setting_of
 
 _IMAGE = re.compile(r'src="([^":]+\.png)"')
 
@@ -51,14 +52,17 @@ def make_report(
     if not runs:
         raise ValueError(f"results: none of the {len(incomplete)} trainings in {results} is complete")
     check_alike(runs)
-    values = [run.trial.hyperparams.get(ablation) for run in runs] if ablation is not None else []
+    values = [setting_of(run.trial, ablation) for run in runs] if ablation is not None else []
     if not all(isinstance(value, (int, float)) for value in values):
         raise ValueError(f"ablation: {ablation!r} given; accepted is a setting that is a number in every training")
     output.mkdir(parents=True, exist_ok=True)
     drawn = _Drawn(output)
     _draw(drawn, runs, ablation)
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sb3_ddiffpg"), undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.PackageLoader("sb3_ddiffpg.visualization"),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     elsewhere = elsewhere_table(runs)
     text = environment.get_template("results.md").render(
@@ -108,8 +112,8 @@ class _Drawn:
 def _draw(drawn: _Drawn, runs: Sequence[Recorded], setting: str | None) -> None:
     for measure, name in (
         ("success_rate", "Success without command"),
-        ("expected_modes", "Ways expected in 20 episodes without command"),
-        ("commanded_modes", "Ways that can be commanded"),
+        ("expected_modes", "Routes expected in 20 episodes without command"),
+        ("commanded_modes", "Routes that can be commanded"),
         ("cells", "Known cells"),
     ):
         if any(measure in run.curve for run in runs):

@@ -1,7 +1,6 @@
 """Run a suite, or what is missing of it."""
 
 import argparse
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -23,6 +22,7 @@ from sb3_ddiffpg.experiments.progress import read_progress
 from sb3_ddiffpg.experiments.record import check_folder, has_record, is_complete, read_record
 from sb3_ddiffpg.experiments.suite import Suite, read_suite, suite_names
 from sb3_ddiffpg.experiments.trial import Trial
+from sb3_ddiffpg.utils.processors import n_processors
 
 _SECONDS_BETWEEN_LOOKS = 0.5
 
@@ -195,7 +195,7 @@ def _run(given: argparse.Namespace, suite: Suite, folder: Path, missing: bool) -
 def _run_alone(given: argparse.Namespace, suite: Suite, folder: Path, missing: bool) -> None:
     name = Path(given.suite).stem
     if missing:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cores = n_processors()
         executor: Executor
         if given.ray is None:
             executor = LocalExecutor(given.workers or max(1, cores // suite.resources.cpus), given.retries)

@@ -9,9 +9,9 @@ from typing import Any
 import pandas as pd
 from msgspec.structs import replace
 
+from sb3_ddiffpg.evaluation.results import ModeEvaluation
 from sb3_ddiffpg.experiments.record import has_record, read_record, trial_of
 from sb3_ddiffpg.experiments.trial import Trial
-from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 
 # What reports tell of every training
 _RECORDED = ("machine", "versions", "git_commit")

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from sb3_ddiffpg.experiments.files import read_yaml, task_file_name
-from sb3_ddiffpg.experiments.trial import Tests, Trial, hyperparameters
+from sb3_ddiffpg.experiments.trial import Tests, Trial, hyperparameters, setting_of
 from sb3_ddiffpg.zoo import ALGO
 
 T = TypeVar("T")
@@ -89,20 +89,20 @@ class Suite(msgspec.Struct, forbid_unknown_fields=True):
                     trial = self._trial(task, name, seed)
                     trial.check()
                     found[Path(task_file_name(task), name, f"seed{seed}")] = trial
-        values = [trial.hyperparams.get(self.ablation) for trial in found.values()] if self.ablation is not None else []
+        values = [] if self.ablation is None else [setting_of(trial, self.ablation) for trial in found.values()]
         if not all(isinstance(value, (int, float)) for value in values):
             raise ValueError(f"ablation: {self.ablation!r} given; accepted is a setting that is a number in every variant")
         return found
 
     def _trial(self, task: str, name: str, seed: int) -> Trial:
         variant = self.variants[name]
-        changes = {**self.settings, **(self.tasks[task] or {}), **variant.settings}
+        changes = self.settings, self.tasks[task] or {}, variant.settings
         return Trial(
             env=task,
             algo=variant.algo,
             variant=name,
             seed=seed,
-            hyperparams=hyperparameters(variant.algo, task, variant.conf_file or self.conf_file, changes),
+            hyperparams=hyperparameters(variant.algo, task, variant.conf_file or self.conf_file, *changes),
             members=variant.members,
             tests=msgspec.structs.replace(self.tests, also=[*self.tests.also, *self.also.get(task, [])]),
         )

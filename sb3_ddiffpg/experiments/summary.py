@@ -14,9 +14,9 @@ import yaml
 from rliable import library, metrics
 from scipy.stats import bootstrap, trim_mean
 
+from sb3_ddiffpg.evaluation.results import ModeEvaluation
 from sb3_ddiffpg.experiments.store import Recorded, by, task_of, variant_of
 from sb3_ddiffpg.experiments.wall_clock import PARTS
-from sb3_ddiffpg.mode_evaluation import ModeEvaluation
 
 N_BOOTSTRAP = 2000
 # Too few for an interval

@@ -19,11 +19,15 @@ import yaml
 from filelock import FileLock, Timeout
 from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalization
 
-from sb3_ddiffpg.actor_critic import NoveltyActorCritic
-from sb3_ddiffpg.callbacks import score
-from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
+from sb3_ddiffpg.callbacks.checkpoint import RunCheckpointCallback
+from sb3_ddiffpg.callbacks.evaluation import score
+from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm
 from sb3_ddiffpg.envs import is_ours, make_vec_env
-from sb3_ddiffpg.evaluation import evaluate_modes
+from sb3_ddiffpg.evaluation.ensemble import evaluate_ensemble
+from sb3_ddiffpg.evaluation.evaluate import evaluate_modes
+from sb3_ddiffpg.evaluation.replanner import Replanner
+from sb3_ddiffpg.evaluation.results import ModeEvaluation
+from sb3_ddiffpg.experiments.ablations import register
 from sb3_ddiffpg.experiments.curve import CurveCallback
 from sb3_ddiffpg.experiments.files import check_output, parse_yaml, task_file_name
 from sb3_ddiffpg.experiments.progress import Progress, ProgressCallback, write_progress
@@ -36,11 +40,9 @@ from sb3_ddiffpg.experiments.record import (
     write_record,
 )
 from sb3_ddiffpg.experiments.trial import Tests, Trial, hyperparameters
-from sb3_ddiffpg.mode_evaluation import ModeEvaluation
-from sb3_ddiffpg.persistence import SavableAlgorithm
-from sb3_ddiffpg.replanning import Replanner
-from sb3_ddiffpg.union import evaluate_union
-from sb3_ddiffpg.zoo import ALGO, ALGOS, ModeExperimentManager, register
+from sb3_ddiffpg.saving.algorithm import SavableAlgorithm
+from sb3_ddiffpg.saving.checkpoint import checkpoint_files
+from sb3_ddiffpg.zoo import ALGO, ALGOS, ModeExperimentManager
 
 N_CHECKPOINTS = 30
 # A killed training's environments may need this long to end and to let go of the folder
@@ -182,7 +184,7 @@ class _Training:
         for name, path in paths.items():
             tested, found = self._tested(path, test_env, seed)
             found.save(self.folder / ("evaluation.json" if name == "best" else "logs/evaluation_final.json"))
-            if name == "best" and isinstance(tested, NoveltyActorCritic):
+            if name == "best" and isinstance(tested, ActorCriticAlgorithm):
                 smaller = self.logs / "model_to_act.zip"
                 tested.save(smaller, to_train=False)
                 os.replace(smaller, path)  # there is no other copy
@@ -228,7 +230,7 @@ def _run_union(trial: Trial, folder: Path) -> None:
         models.append(ALGOS[trial.algo].load(place / "model.zip"))
         write_progress(folder / "logs", Progress(steps * (number + 1), steps * trial.members))
     env_kwargs = trial.hyperparams.get("env_kwargs", {})
-    found = evaluate_union(models, trial.env, trial.tests.n_episodes, seed=trial.seed + 1_000, **env_kwargs)
+    found = evaluate_ensemble(models, trial.env, trial.tests.n_episodes, seed=trial.seed + 1_000, **env_kwargs)
     found.save(folder / "evaluation.json")
     print(f"\nunion\n{found}")
     record["result"] = {

@@ -12,10 +12,11 @@ import gymnasium as gym
 import msgspec
 import yaml
 
+from sb3_ddiffpg.experiments.ablations import register, settings_file
 from sb3_ddiffpg.experiments.files import read_yaml
-from sb3_ddiffpg.persistence import SavableAlgorithm
-from sb3_ddiffpg.validation import check_ranges
-from sb3_ddiffpg.zoo import ALGOS, check_hyperparameters, config_file, register
+from sb3_ddiffpg.saving.algorithm import SavableAlgorithm
+from sb3_ddiffpg.utils.arguments import check_arguments, grouped
+from sb3_ddiffpg.zoo import ALGOS, check_hyperparameters, config_file
 
 
 class Tests(msgspec.Struct, forbid_unknown_fields=True):
@@ -70,7 +71,8 @@ class Trial(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
         try:
             check_hyperparameters(self.algo, list(self.hyperparams))
             if issubclass(ALGOS[self.algo], SavableAlgorithm):  # the zoo makes more of texts and lists
-                check_ranges({name: each for name, each in self.hyperparams.items() if not isinstance(each, (str, list))})
+                given = {name: each for name, each in self.hyperparams.items() if not isinstance(each, (str, list))}
+                check_arguments(ALGOS[self.algo], given)
         except (TypeError, ValueError) as error:
             raise ValueError(f"settings of {self.variant} in {self.env}: {error}") from None
         if re.fullmatch(r"\w([\w .,+=()-]{0,59}[\w.,+=()-])?", self.variant) is None:
@@ -107,23 +109,41 @@ class Trial(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
                 raise ValueError(f"also: {env_id} given, whose observations or actions are not those of {self.env}")
 
 
-def hyperparameters(algo: str, env_id: str, conf_file: str | None, overrides: dict[str, Any]) -> dict[str, Any]:
+def hyperparameters(algo: str, env_id: str, conf_file: str | None, *overrides: dict[str, Any]) -> dict[str, Any]:
     """
     :param algo: Name of the algorithm in the zoo
     :param env_id: Id of the environment
     :param conf_file: A YAML file as the zoo's, or the name of one of ours; the algorithm's own when None
-    :param overrides: What differs from its entry
+    :param overrides: What differs from its entry; of a group of settings only what is given, the last one holds
     :return: The settings
     :raises ValueError: If there is no such file or entry
     """
-    path = config_file(conf_file or algo) or Path(conf_file or algo)
+    path = config_file(conf_file or settings_file(algo)) or Path(conf_file or algo)
     if not path.is_file():
         raise ValueError(f"conf-file: {conf_file!r} given for {algo!r}; accepted is a YAML file, or the name of one of ours")
     entries = _entries(path, path.stat().st_mtime_ns)
     if not isinstance(entries, dict) or not isinstance(entries.get(env_id), dict):
         known = ", ".join(sorted(map(str, entries.keys() - {"default", "paper"}))) if isinstance(entries, dict) else "nothing"
         raise ValueError(f"env: {env_id!r} given; {path.name} has settings for {known}")
-    return {name: _number(value) for name, value in {**entries[env_id], **overrides}.items()}
+    register()
+    algorithm: Any = ALGOS.get(algo)
+    settings = entries[env_id]
+    for each in overrides:
+        own = isinstance(algorithm, type) and issubclass(algorithm, SavableAlgorithm)
+        settings = grouped(algorithm, settings, each) if own else {**settings, **each}
+    return {name: _number(value) for name, value in settings.items()}
+
+
+def setting_of(trial: Trial, name: str) -> Any:
+    """
+    :param trial: A training
+    :param name: Of one of its settings: ``"batch_size"``, or ``"target_action.learning_rate"`` of a group
+    :return: Its value, None if nothing is said of it
+    """
+    value: Any = trial.hyperparams
+    for part in name.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    return value
 
 
 @cache
@@ -154,6 +174,8 @@ def _spaces_of(env_id: str, env_kwargs: str) -> tuple[gym.Space, gym.Space]:
 
 def _number(value: Any) -> Any:
     """YAML reads 1e5 as a string."""
+    if isinstance(value, dict):
+        return {name: _number(each) for name, each in value.items()}
     try:
         return float(value) if isinstance(value, str) else value
     except ValueError:

@@ -20,8 +20,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_ddiffpg.baselines import BASELINES
-from sb3_ddiffpg.checkpoints import checkpoint_files
-from sb3_ddiffpg.ddiffpg import DDiffPG
+from sb3_ddiffpg.ddiffpg.ddiffpg import DDiffPG
+from sb3_ddiffpg.saving.checkpoint import checkpoint_files
 from sb3_ddiffpg.zoo.manager import ModeExperimentManager
 from sb3_ddiffpg.zoo.registration import register
 from sb3_ddiffpg.zoo.settings import ALGO, ALGOS, check_config_file, config_file

@@ -11,14 +11,15 @@ from rl_zoo3.utils import SimpleLinearSchedule
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
-from sb3_ddiffpg.baselines import BASELINES
-from sb3_ddiffpg.checkpoints import RunCheckpointCallback
+from sb3_ddiffpg.callbacks.checkpoint import RunCheckpointCallback
+from sb3_ddiffpg.common.schedules import LateLinearSchedule
 from sb3_ddiffpg.envs import is_ours, make_vec_env
-from sb3_ddiffpg.envs.turns import TurnVecEnv
-from sb3_ddiffpg.envs.workers import WorkerVecEnv
-from sb3_ddiffpg.full_disk import spared_monitor
-from sb3_ddiffpg.schedules import LateLinearSchedule
-from sb3_ddiffpg.zoo.settings import ALGO, ALGOS, check_hyperparameters
+from sb3_ddiffpg.envs.vec_env.tracing import TracingDummyVecEnv
+from sb3_ddiffpg.envs.vec_env.workers import WorkerVecEnv
+from sb3_ddiffpg.saving.algorithm import SavableAlgorithm
+from sb3_ddiffpg.utils.arguments import one_by_one
+from sb3_ddiffpg.utils.disk import spared_monitor
+from sb3_ddiffpg.zoo.settings import ALGOS, check_hyperparameters
 
 # How a learning rate may be given: 3e-4, `lin_3e-4`, `late_3e-4`
 SCHEDULES: dict[str, Callable[[float], Any]] = {"": float, "lin": SimpleLinearSchedule, "late": LateLinearSchedule}
@@ -39,11 +40,13 @@ class ModeExperimentManager(ExperimentManager):
     def __init__(self, *args: Any, checkpoint_freq: int = 0, resume: Path | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.checkpoint_freq, self.resume = checkpoint_freq, resume
-        self.is_own = self.algo == ALGO or self.algo in BASELINES
+        self.is_own = issubclass(ALGOS[self.algo], SavableAlgorithm)
         if self.is_own:
             self.deterministic_eval = False
+            # Or `critic` on the command line would replace all of the file's
+            self.custom_hyperparams = one_by_one(ALGOS[self.algo], self.custom_hyperparams or {})
         # They say where an error was raised, and Ctrl-C does not end the workers
-        better: dict[Any, Any] = {DummyVecEnv: TurnVecEnv, SubprocVecEnv: WorkerVecEnv}
+        better: dict[Any, Any] = {DummyVecEnv: TracingDummyVecEnv, SubprocVecEnv: WorkerVecEnv}
         self.vec_env_class = better.get(self.vec_env_class, self.vec_env_class)
         if resume is not None:
             self.continue_training = True  # with what ``_load_pretrained_agent`` gives

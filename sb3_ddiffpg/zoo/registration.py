@@ -7,8 +7,8 @@ import rl_zoo3.train
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
 from sb3_ddiffpg.baselines import BASELINES
-from sb3_ddiffpg.callbacks import ModeEvalCallback
-from sb3_ddiffpg.ddiffpg import DDiffPG
+from sb3_ddiffpg.callbacks.evaluation import ModeEvalCallback
+from sb3_ddiffpg.ddiffpg.ddiffpg import DDiffPG
 from sb3_ddiffpg.zoo.manager import ModeExperimentManager
 from sb3_ddiffpg.zoo.search import convert_params, sample_params
 from sb3_ddiffpg.zoo.settings import ALGO, ALGOS

@@ -38,14 +38,15 @@ def sample_params(
         "batch_size_pow": trial.suggest_int("batch_size_pow", 7, 12),
         "tau": trial.suggest_float("tau", 0.005, 0.1, log=True),
         "gradient_steps": trial.suggest_int("gradient_steps", 1, 8, log=True),
-        "intrinsic_coef": trial.suggest_float("intrinsic_coef", 1e-3, 1.0, log=True),
+        "novelty.coef": trial.suggest_float("novelty.coef", 1e-3, 1.0, log=True),
     }
     if algo in (ALGO, "dipo"):
-        sampled["action_lr"] = trial.suggest_float("action_lr", 0.01, 0.5, log=True)
-        sampled["n_action_gradient_steps"] = trial.suggest_int("n_action_gradient_steps", 1, 20, log=True)
+        learning_rate, n_steps = "target_action.learning_rate", "target_action.n_steps"
+        sampled[learning_rate] = trial.suggest_float(learning_rate, 0.01, 0.5, log=True)
+        sampled[n_steps] = trial.suggest_int(n_steps, 1, 20, log=True)
     if algo == ALGO:
-        sampled["mode_n_steps"] = trial.suggest_int("mode_n_steps", 1, 5)
-        sampled["mode_mask_prob"] = trial.suggest_float("mode_mask_prob", 0.1, 0.8)
+        sampled["modes.n_steps"] = trial.suggest_int("modes.n_steps", 1, 5)
+        sampled["modes.mask_prob"] = trial.suggest_float("modes.mask_prob", 0.1, 0.8)
         sampled["recluster_freq"] = trial.suggest_categorical("recluster_freq", [25, 50, 100, 200])
     else:
         sampled["n_steps"] = trial.suggest_int("n_steps", 1, 5)

@@ -3,42 +3,21 @@
 import difflib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
 from rl_zoo3.utils import ALGOS
 
-from sb3_ddiffpg.model_file import constructor_arguments
+from sb3_ddiffpg.common.presets import ZOO_KEYS, config_file
+from sb3_ddiffpg.saving.algorithm import SavableAlgorithm
+from sb3_ddiffpg.utils.arguments import GONE, constructor_arguments, groups_of, single_setting
 
 ALGO = "ddiffpg"
 
-# Keys of the zoo's YAML files that its ExperimentManager takes out before it calls the algorithm
-ZOO_KEYS = {
-    "callback",
-    "env_kwargs",
-    "env_wrapper",
-    "frame_stack",
-    "monitor_kwargs",
-    "n_envs",
-    "n_timesteps",
-    "noise_std",
-    "noise_type",
-    "normalize",
-    "vec_env_wrapper",
-}
+__all__ = ["ALGO", "ALGOS", "check_config_file", "check_hyperparameters", "config_file"]
+
 # Constructor arguments that come from the command line
 COMMAND_LINE_ARGUMENTS = {"env", "tensorboard_log", "seed", "verbose", "device", "_init_setup_model"}
-
-
-def config_file(name: str) -> Path | None:
-    """
-    :param name: Of a YAML file of ours: ``ddiffpg`` or ``ddiffpg-cpu``
-    :return: Where it is, installed or in a checkout; None when there is none
-    """
-    package = Path(__file__).parent.parent
-    for folder in (package, package.parent):
-        if (path := folder / "zoo_hyperparams" / f"{name}.yml").is_file():
-            return path
-    return None
 
 
 def check_config_file(path: str | Path | None, env_id: str | None) -> None:
@@ -60,6 +39,12 @@ def check_config_file(path: str | Path | None, env_id: str | None) -> None:
         raise SystemExit(f"--conf-file: {path} has {str(own)[:100]!r} for {env_id}; accepted is a mapping of hyperparameters")
 
 
+def _is_setting(algorithm: Any, key: str) -> bool:
+    """Whether it is one of a group, as ``critic.v_max``, or of version 0.1."""
+    single = single_setting(algorithm, key)
+    return key in GONE or (single is not None and single[1] in groups_of(algorithm)[single[0]].names())
+
+
 def check_hyperparameters(algo: str, keys: Sequence[str]) -> None:
     """
     The zoo hands unknown keys on when it builds a model, and drops them silently when it resumes one.
@@ -70,8 +55,9 @@ def check_hyperparameters(algo: str, keys: Sequence[str]) -> None:
         takes those for an unlucky trial when it optimises.
     """
     arguments = constructor_arguments(ALGOS[algo]) - COMMAND_LINE_ARGUMENTS
+    own = issubclass(ALGOS[algo], SavableAlgorithm)
     for key in keys:
-        if key in arguments or key in ZOO_KEYS:
+        if key in arguments or key in ZOO_KEYS or (own and _is_setting(ALGOS[algo], key)):
             continue
         near = difflib.get_close_matches(key, sorted(arguments | ZOO_KEYS))
         hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"it takes {', '.join(sorted(arguments))}"

@@ -1,6 +1,6 @@
 """
-How the files in this folder were made, by version 0.1.0 (commit cb786e4): of each algorithm a .zip, a safe file, a checkpoint, a
-replay buffer, and what the model did.
+How the files in this folder were made, by version 0.1.0 (commit cb786e4): of each algorithm a .zip, a safe file, a checkpoint,
+a replay buffer, and what the model did.
 
 ``PYTHONPATH=<checkout of cb786e4> python make.py FOLDER``
 """
@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
+from sb3_ddiffpg.schedules import LateLinearSchedule
 
 from sb3_ddiffpg import DDiffPG, __version__
 from sb3_ddiffpg.baselines import BASELINES
-from sb3_ddiffpg.checkpoints import RunCheckpointCallback, checkpoint_files
 from sb3_ddiffpg.envs import make_vec_env
-from sb3_ddiffpg.schedules import LateLinearSchedule
 
 MAZE = ["#######", "#g.r.g#", "#######"]
 COMMON: dict[str, Any] = dict(

@@ -1,1 +1,1 @@
-"""Manipulation with a Franka Panda arm (pybullet), each task with several ways to do it."""
+"""Manipulation with a Franka Panda arm (pybullet), each task with several routes."""

@@ -10,8 +10,8 @@ from gymnasium import spaces
 
 from sb3_ddiffpg.envs.franka.arm import FloatArray, PandaArm
 from sb3_ddiffpg.envs.franka.bodies import Color, Triple, box
-from sb3_ddiffpg.rng import restore_generator
-from sb3_ddiffpg.safe_files import check_array, convert
+from sb3_ddiffpg.serialization.random_states import restore_generator
+from sb3_ddiffpg.serialization.safetensors_tree import check_array, convert
 
 Image = npt.NDArray[np.uint8]
 
@@ -28,8 +28,8 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
     """
     A Panda arm with a task. The observation is position and velocity of the point between the fingertips, then what the task
     adds; an action turns the seven joints. The reward is 1 when the task is done, which ends the episode, and 0 before.
-    ``info`` holds on every step ``is_success`` and ``mode`` (the way it was done; None before). The time limit is the
-    registration's (100 steps of 0.04 s).
+    ``info`` holds on every step ``is_success`` and ``mode`` (the route by which it was done; None before). The time limit is
+    the registration's (100 steps of 0.04 s).
 
     :param render_mode: None or ``"rgb_array"``
     :param obs_joints: whether the seven joint angles are observed too
@@ -41,11 +41,11 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
     base_x: ClassVar[float]
     start_angles: ClassVar[tuple[float, ...]]
     default_start_noise: ClassVar[float] = 0.0
-    #: Where in the observation ways differ: the fingertips' position
+    #: Where in the observation routes differ: the fingertips' position
     feature_indices: ClassVar[tuple[int, ...]] = (0, 1, 2)
     #: Edge of the cells in which visits are counted, for maps and for novelty, in metres
     cell_size: ClassVar[float] = 0.05
-    #: The ways of doing it
+    #: The routes by which it can be done
     listed_modes: ClassVar[tuple[str, ...]]
     force_scale: ClassVar[float] = 1.0
     tool: ClassVar[str] = ""
@@ -109,7 +109,7 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         """Take note of a movement of the fingertips."""
 
     def _done_by(self) -> str | None:
-        """The way by which the task is done, None if it is not."""
+        """The route by which the task is done, None if it is not."""
         raise NotImplementedError
 
     # ------------------------------------------------------------------ gymnasium

@@ -1,4 +1,4 @@
-"""The tasks: what stands around the arm, what counts as done, and by which of several ways."""
+"""The tasks: what stands around the arm, what counts as done, and by which of several routes."""
 
 import numpy as np
 
@@ -98,7 +98,7 @@ class FrankaPegInHole(FrankaEnv):
 class FrankaDrawerClose(FrankaEnv):
     """
     Close one of four open drawers. The mode is the drawer: ``"left-up"``, ``"left-down"``, ``"right-up"`` or ``"right-down"``
-    (left: positive y). The four openings (m) are observed, and are where ways differ: any part of the arm may push a drawer.
+    (left: positive y). The four openings (m) are observed, and are where routes differ: any part of the arm may push a drawer.
     """
 
     listed_modes = QUARTERS

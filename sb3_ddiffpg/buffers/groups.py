@@ -1,0 +1,70 @@
+"""Finished trajectories by mode and outcome: which of them leave the buffer first."""
+
+from collections import deque
+
+from sb3_ddiffpg.buffers.trajectory import NO_MODE, Trajectory
+
+#: Index of a mode (or ``NO_MODE``), and whether its trajectories reached the goal by its own route
+Key = tuple[int, bool]
+
+
+class TrajectoryGroups:
+    """
+    Trajectories in use, by mode and outcome, and retired ones. The oldest retired one leaves first, then the oldest of
+    whichever group holds most rows, so that a rare mode is never crowded out.
+    """
+
+    def __init__(self) -> None:
+        self.members: dict[Key, deque[Trajectory]] = {}
+        self.n_rows: dict[Key, int] = {}
+        self.retired: deque[Trajectory] = deque()
+        #: Indices of modes whose successes leave last
+        self.frozen_modes: set[int] = set()
+
+    def insert(self, trajectory: Trajectory) -> None:
+        """
+        :param trajectory: Newer than the others of its group
+        """
+        key = self._key(trajectory)
+        self.members.setdefault(key, deque()).append(trajectory)
+        self.n_rows[key] = self.n_rows.get(key, 0) + trajectory.length
+
+    @staticmethod
+    def _key(trajectory: Trajectory) -> Key:
+        return trajectory.mode, trajectory.success and not trajectory.off_mode_success
+
+    def remove(self, trajectory: Trajectory) -> None:
+        """
+        :param trajectory: One of those in use
+        """
+        key = self._key(trajectory)
+        self.members[key].remove(trajectory)
+        self.n_rows[key] -= trajectory.length
+
+    def pop_oldest(self) -> Trajectory | None:
+        """
+        :return: The trajectory that leaves first, None if none may
+        """
+        if self.retired:
+            return self.retired.popleft()
+        # The last success of a mode stays: without it the mode would have nothing to learn from
+        spare = [key for key, group in self.members.items() if len(group) > (key[0] != NO_MODE and key[1])]
+        spare = [key for key in spare if not (key[0] in self.frozen_modes and key[1])] or spare
+        if not spare:
+            return None
+        largest = max(spare, key=lambda key: self.n_rows[key])
+        trajectory = self.members[largest].popleft()
+        self.n_rows[largest] -= trajectory.length
+        return trajectory
+
+    def of(self, success: bool) -> list[Trajectory]:
+        """
+        :param success: Goal-reached or failed ones (and those that reached it off their mode's route)
+        :return: Those in use, in order of finishing
+        """
+        found = [each for key, group in self.members.items() if key[1] == success for each in group]
+        return sorted(found, key=lambda trajectory: trajectory.serial)
+
+    def clear(self) -> None:
+        """Forget those in use; retired ones stay."""
+        self.members, self.n_rows = {}, {}

@@ -1,0 +1,74 @@
+"""Multi-step returns of the transitions of all groups: what of a window counts, and what ends it."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
+
+
+class GroupReturns(NamedTuple):
+    """
+    Returns of n transitions of each of G groups, over windows of up to ``n_steps``.
+
+    ``rewards`` [G, n] are discounted sums, ``discounts`` [G, n] what the value at the window's last step counts, and
+    ``new_routes`` [n] the part of the exploratory group's rewards from goals by routes of which a mode has not its fill.
+    ``last`` [G, n] are the last steps' rows, and ``lost`` [G, n, n_steps] the steps that lie beyond the mode's route.
+    """
+
+    rewards: np.ndarray
+    discounts: np.ndarray
+    new_routes: np.ndarray
+    last: np.ndarray
+    lost: np.ndarray
+
+
+def group_returns(
+    windows: np.ndarray,
+    notes: np.ndarray,
+    rewards: np.ndarray,
+    gammas: np.ndarray,
+    explore_beyond_goals: bool,
+    new_routes_pay: bool,
+) -> GroupReturns:
+    """
+    :param windows: Rows from each transition on, -1 where they end, [G, n, n_steps]; the exploratory group first
+    :param notes: What the buffer has noted of these steps, same shape
+    :param rewards: Theirs, as they train, same shape
+    :param gammas: Discount factor of each group, [G]
+    :param explore_beyond_goals: Whether a goal does not end the exploratory group's returns
+    :param new_routes_pay: Whether that group is paid for goals by new routes
+    :return: The returns
+    """
+    present = windows >= 0
+    gammas = gammas.astype(np.float32)[:, None]
+    # For its mode a step off the route ends the episode without reward, so that no way back is worth anything
+    lost = np.logical_or.accumulate(notes["off_route"] & present, axis=-1)
+    lost[EXPLORATORY_GROUP] = False
+    powers = gammas[..., None] ** np.arange(windows.shape[-1], dtype=np.float32)
+    rewards = np.where(present & ~lost, rewards, 0.0) * powers
+    lengths = present.sum(axis=-1)
+    ends = lengths[..., None] - 1
+    ended = np.take_along_axis(notes["dones"] & ~notes["timeouts"], ends, axis=-1)[..., 0]
+    if explore_beyond_goals:
+        # A goal that ended what exploring is worth would be the one place that explorers keep away from. One that is paid
+        # for ends it, or it would be paid again and again
+        unpaid = notes["goals"] & ~((notes["route_novelty"] > 0) & new_routes_pay)
+        ended[EXPLORATORY_GROUP] &= ~np.take_along_axis(unpaid, ends, axis=-1)[EXPLORATORY_GROUP, :, 0]
+    return GroupReturns(
+        rewards=rewards.sum(axis=-1),
+        discounts=gammas**lengths * ~(ended | lost.any(axis=-1)),
+        new_routes=(rewards[EXPLORATORY_GROUP] * notes["route_novelty"][EXPLORATORY_GROUP]).sum(axis=-1),
+        last=np.take_along_axis(windows, ends, axis=-1)[..., 0],
+        lost=lost,
+    )
+
+
+def discounted_returns(rewards: np.ndarray, gamma: float) -> np.ndarray:
+    """
+    :param rewards: Of an episode, shape [length]
+    :param gamma: Discount factor
+    :return: From each step on, the last first, same shape
+    """
+    return lfilter([1.0], [1.0, -gamma], rewards[::-1])

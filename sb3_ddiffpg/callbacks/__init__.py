@@ -1,0 +1,8 @@
+"""Callbacks: when to re-cluster, evaluation and pictures during training, checkpoints."""
+
+from sb3_ddiffpg.callbacks.checkpoint import RunCheckpointCallback
+from sb3_ddiffpg.callbacks.clustering import ClusteringCallback
+from sb3_ddiffpg.callbacks.evaluation import EvaluateModesCallback, ModeEvalCallback
+from sb3_ddiffpg.callbacks.figures import ModeFigureCallback
+
+__all__ = ["ClusteringCallback", "EvaluateModesCallback", "ModeEvalCallback", "ModeFigureCallback", "RunCheckpointCallback"]

@@ -1,0 +1,1 @@
+"""What all algorithms of this package share."""

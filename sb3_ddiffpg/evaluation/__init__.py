@@ -1,0 +1,20 @@
+"""Trained models put to the test: episodes, modes counted by ground truth, replanning."""
+
+from sb3_ddiffpg.evaluation.ensemble import PolicyEnsemble, evaluate_ensemble
+from sb3_ddiffpg.evaluation.evaluate import clustering_agreement, evaluate_modes
+from sb3_ddiffpg.evaluation.replanner import Replanner
+from sb3_ddiffpg.evaluation.results import CommandResult, ModeEvaluation, RouteResult
+from sb3_ddiffpg.evaluation.rollout import EpisodeResult, run_episodes
+
+__all__ = [
+    "CommandResult",
+    "EpisodeResult",
+    "ModeEvaluation",
+    "PolicyEnsemble",
+    "Replanner",
+    "RouteResult",
+    "clustering_agreement",
+    "evaluate_ensemble",
+    "evaluate_modes",
+    "run_episodes",
+]

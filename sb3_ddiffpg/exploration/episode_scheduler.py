@@ -1,0 +1,153 @@
+"""What drives each environment through its episode: exploration, a mode, or the zero embedding."""
+
+from collections.abc import Sized
+from typing import Any
+
+import msgspec
+import numpy as np
+from stable_baselines3.common.utils import FloatSchedule
+
+from sb3_ddiffpg.exploration.settings import ExplorationSettings
+from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
+from sb3_ddiffpg.serialization.safetensors_tree import Count, check_array, convert
+
+#: In place of a row of the policy's embedding table: the zero embedding
+UNCONDITIONED = -1
+
+
+class _State(msgspec.Struct, forbid_unknown_fields=True):
+    groups: np.ndarray
+    explored: np.ndarray
+    handed_over: np.ndarray
+    may_hand_over: np.ndarray
+    n_turns: Count
+
+
+class EpisodeScheduler:
+    """
+    The group that drives each environment. It is drawn at an episode's beginning and kept through it: redrawn at every step
+    it would mix several in one trajectory. Only an exploring episode may hand over once, to a mode or the zero embedding.
+
+    :param settings: Who explores
+    :param modes: The modes of now, of which only the number M is asked
+    :param n_envs: Number of environments
+    """
+
+    def __init__(self, settings: ExplorationSettings, modes: Sized, n_envs: int = 0) -> None:
+        self.settings, self.modes = settings, modes
+        self.n_turns = 0
+        self._forget(n_envs)
+
+    def _forget(self, n_envs: int) -> None:
+        self.groups = np.zeros(n_envs, dtype=np.int64)
+        #: Whether the episode began exploring, has handed over, and may yet
+        self.explored = np.zeros(n_envs, dtype=bool)
+        self.handed_over = np.zeros(n_envs, dtype=bool)
+        self.may_hand_over = np.zeros(n_envs, dtype=bool)
+
+    def exploration_share(self, progress_remaining: float) -> float:
+        """
+        :param progress_remaining: Of the training, from 1 to 0
+        :return: Share of the episodes that explore
+        """
+        share = self.settings.share
+        if share is None:
+            return 1 / (len(self.modes) + 1) if 1 - progress_remaining < self.settings.fraction else 0.0
+        return float(FloatSchedule(share)(progress_remaining))
+
+    def begin_all(self, n_envs: int, exploration_share: float) -> None:
+        """
+        New episodes everywhere.
+
+        :param n_envs: Number of environments
+        :param exploration_share: Probability that an episode explores
+        """
+        self._forget(n_envs)
+        for env in range(n_envs):
+            self.begin(env, exploration_share)
+
+    def begin(self, env: int, exploration_share: float) -> None:
+        """
+        A new episode in one environment.
+
+        :param env: Index of the environment
+        :param exploration_share: Probability that the episode explores
+        """
+        self.groups[env] = group = self.draw(exploration_share)
+        self.explored[env] = group == EXPLORATORY_GROUP
+        self.handed_over[env] = False
+        share = self.settings.hand_over if group == EXPLORATORY_GROUP else 0.0
+        self.may_hand_over[env] = np.random.rand() < share
+
+    def draw(self, exploration_share: float) -> int:
+        """
+        :param exploration_share: Probability of exploring; 1 also while there is no mode
+        :return: The exploratory group, or in turn a mode's or none
+        """
+        if not len(self.modes) or np.random.rand() < exploration_share:
+            return EXPLORATORY_GROUP
+        return self._next_in_turn()
+
+    def _next_in_turn(self) -> int:
+        self.n_turns += 1
+        turn = self.n_turns % (len(self.modes) + 1)
+        return UNCONDITIONED if turn == 0 else turn
+
+    def hand_over(self, probability: float) -> None:
+        """
+        Let some exploring episodes go on with another group.
+
+        :param probability: Of each episode that may hand over
+        """
+        leaves = self.may_hand_over & (np.random.rand(len(self.groups)) < probability)
+        for env in np.flatnonzero(leaves):
+            self.groups[env] = self._next_in_turn()
+            self.handed_over[env], self.may_hand_over[env] = True, False
+
+    def assigned_mode(self, env: int) -> int | None:
+        """
+        :param env: Index of the environment
+        :return: The mode that its episode is told to follow, None if none is or it began exploring
+        """
+        group = int(self.groups[env])
+        return group - 1 if group > EXPLORATORY_GROUP and not self.explored[env] else None
+
+    def commanded_mode(self, env: int) -> int | None:
+        """
+        :param env: Index of the environment
+        :return: The mode that has driven its episode from the beginning, None if none has
+        """
+        return None if self.handed_over[env] else self.assigned_mode(env)
+
+    def follow(self, new_modes: list[int | None]) -> None:
+        """
+        After a re-clustering the environments go on with the mode they follow, whatever its index is now.
+
+        :param new_modes: New index of every old mode, None if it is gone
+        """
+        groups = {old + 1: UNCONDITIONED if new is None else new + 1 for old, new in enumerate(new_modes)}
+        self.groups = np.array([groups.get(group, group) for group in self.groups.tolist()], dtype=np.int64)
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: Who drives what, for ``load_state_dict``
+        """
+        return {name: getattr(self, name) for name in _State.__struct_fields__}
+
+    def load_state_dict(self, state: Any, n_envs: int) -> None:
+        """
+        :param state: What ``state_dict`` gave
+        :param n_envs: Number of environments
+        :raises ValueError: If it is something else
+        """
+        known, n_modes = convert(state, _State, "episodes"), len(self.modes)
+        check_array(known.groups, np.int64, [n_envs], "episodes.groups")
+        for name in ("explored", "handed_over", "may_hand_over"):
+            check_array(getattr(known, name), bool, known.groups.shape, f"episodes.{name}")
+        if len(known.groups) and not UNCONDITIONED <= known.groups.min() <= known.groups.max() <= n_modes:
+            raise ValueError(
+                f"episodes.groups: there are {n_modes} modes, groups from {known.groups.min()} to {known.groups.max()}"
+            )
+        for name in _State.__struct_fields__:
+            value = getattr(known, name)
+            setattr(self, name, value.copy() if isinstance(value, np.ndarray) else value)

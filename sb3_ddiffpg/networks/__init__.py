@@ -1,0 +1,1 @@
+"""Networks: critics of all modes, the diffusion model, policies of an actor and twin critics."""

@@ -1,0 +1,1 @@
+"""What nothing of ours lies below: random states, signals, schedules, full disks, training that diverges."""

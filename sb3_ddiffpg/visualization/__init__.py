@@ -1,0 +1,1 @@
+"""Pictures and reports of a model. Needs the extra ``plots``."""
