@@ -162,7 +162,7 @@ class KnownCells(CellTable):
             before
         """
         # Of a file of version 0.1 it is not known whose they are: they stay until every mode has told its own
-        nobodys = self.known.nonzero()[:, 0].cpu().numpy() if self.known.any() and not self.by_mode else np.empty(0, np.int64)
+        nobodys = self.known.nonzero()[:, 0].cpu().numpy() if self.any and not self.by_mode else np.empty(0, np.int64)
         before = self.by_mode
         self.by_mode = {
             number: before.get(number, nobodys) if each is None else self._entries(each).unique().cpu().numpy()
@@ -171,7 +171,7 @@ class KnownCells(CellTable):
         self.known.zero_()
         for entries in self.by_mode.values():
             self.known[th.from_numpy(entries).to(self.known.device)] = True
-        self.any = bool(self.known.any())
+        self.any = any(map(len, self.by_mode.values()))
 
     def _load_from_state_dict(self, *args: Any) -> None:
         super()._load_from_state_dict(*args)
