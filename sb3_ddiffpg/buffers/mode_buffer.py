@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.buffers._pickle_of_0_1 import state_of_pickle
@@ -16,7 +15,6 @@ from sb3_ddiffpg.buffers.routes import off_route, split_detours
 from sb3_ddiffpg.buffers.state import buffer_state, restore_buffer
 from sb3_ddiffpg.buffers.storage import Fields, RowSet
 from sb3_ddiffpg.buffers.trajectory import NO_MODE, Trajectory
-from sb3_ddiffpg.clustering.paths import LOOP_SHARE, N_PATH_POINTS
 from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
 from sb3_ddiffpg.serialization.codec import registered
 from sb3_ddiffpg.utils.settings import FLAG, SHARE, Accepted, at_least, is_number
@@ -36,28 +34,16 @@ class ModeReplayBuffer(PathReplayBuffer):
     A ``PathReplayBuffer`` whose trajectories belong to modes. Each row has two target actions: one for the mode that
     owns its trajectory, one for the exploratory group.
 
-    :param buffer_size: Capacity in transitions (over all environments)
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param device: PyTorch device of the samples
-    :param n_envs: Number of parallel environments
-    :param optimize_memory_usage: Not supported
-    :param handle_timeout_termination: Whether time limits are bootstrapped through
-    :param success_key: See ``TrajectoryReplayBuffer``
-    :param storage_device: See ``TrajectoryReplayBuffer``
-    :param mode_features: See ``ModeFeatures``
+    :param args: Of ``PathReplayBuffer``
     :param max_successes_per_mode: Newest goal-reached trajectories that train a mode; older ones serve exploration only
     :param max_failures_per_mode: Newest failed trajectories that train a mode
     :param max_length_ratio: An uncommanded success longer than this times the mode's shortest is a detour: it is remembered
         for the next clustering, but trains no mode
     :param min_direct: The mode's shortest successes, so many, are never detours
-    :param n_path_points: See ``PathReplayBuffer``
-    :param normalize_distances: See ``PathReplayBuffer``
-    :param compared_length: See ``PathReplayBuffer``
-    :param loop_share: See ``PathReplayBuffer``
     :param new_route_share: Share of the exploratory group's rows that are drawn from trajectories which reached a goal by a
         route of which a mode has not its fill
     :param explore_beyond_goals: Whether a goal does not end the exploratory group's returns
+    :param kwargs: Of ``PathReplayBuffer``
     :raises ValueError: If an argument is out of its range or ``optimize_memory_usage`` is asked for
     """
 
@@ -72,31 +58,18 @@ class ModeReplayBuffer(PathReplayBuffer):
 
     def __init__(
         self,
-        buffer_size: int,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        device: th.device | str = "auto",
-        n_envs: int = 1,
-        optimize_memory_usage: bool = False,
-        handle_timeout_termination: bool = True,
-        success_key: str | None = None,
-        storage_device: th.device | str = "cpu",
-        mode_features: Any = None,
+        *args: Any,
         max_successes_per_mode: int = 40,
         max_failures_per_mode: int = 20,
         max_length_ratio: float = 1.5,
         min_direct: int = 5,
-        n_path_points: int = N_PATH_POINTS,
-        normalize_distances: bool = True,
-        compared_length: float | None = None,
-        loop_share: float = LOOP_SHARE,
         new_route_share: float = 0.0,
         explore_beyond_goals: bool = False,
-        **of_0_1: Any,
+        **kwargs: Any,
     ) -> None:
-        new_route_share = of_0_1.pop("new_way_share", new_route_share)
-        if unknown := set(of_0_1) - {"visit_cell_size", "route_share"}:  # the bonus's, and a constant
-            raise TypeError(f"{type(self).__name__} has no arguments {sorted(unknown)}")
+        for gone in ("visit_cell_size", "route_share"):  # of version 0.1: the bonus's, and a constant
+            kwargs.pop(gone, None)
+        new_route_share = kwargs.pop("new_way_share", new_route_share)
         for name, accepted, value in (
             ("max_successes_per_mode", at_least(1), max_successes_per_mode),
             ("max_failures_per_mode", at_least(1), max_failures_per_mode),
@@ -112,22 +85,7 @@ class ModeReplayBuffer(PathReplayBuffer):
         self.min_direct = min_direct
         self.new_route_share = new_route_share
         self.explore_beyond_goals = explore_beyond_goals
-        super().__init__(
-            buffer_size,
-            observation_space,
-            action_space,
-            device,
-            n_envs=n_envs,
-            optimize_memory_usage=optimize_memory_usage,
-            handle_timeout_termination=handle_timeout_termination,
-            success_key=success_key,
-            storage_device=storage_device,
-            mode_features=mode_features,
-            n_path_points=n_path_points,
-            normalize_distances=normalize_distances,
-            compared_length=compared_length,
-            loop_share=loop_share,
-        )
+        super().__init__(*args, **kwargs)
 
     # ------------------------------------------------------------------ storage
 
@@ -177,9 +135,22 @@ class ModeReplayBuffer(PathReplayBuffer):
         self.off_mode_success[rows] = self.off_route[rows] = self.goals[rows] = False
         self.route_novelty[rows] = 0.0
 
+    def state_dict(self) -> dict[str, Any] | None:
+        """
+        :return: All that it holds, in plain values and arrays, for ``load_state_dict``; None while that is nothing
+        """
+        return buffer_state(self)
+
+    def load_state_dict(self, state: Any) -> None:
+        """
+        :param state: What ``state_dict`` gave, of a buffer for the same spaces and number of environments
+        :raises ValueError: If it is something else; the buffer is as before then
+        """
+        restore_buffer(self, state)
+
     def __getstate__(self) -> dict[str, Any]:
         """Only used rows are pickled."""
-        return {**self.settings(), "n_modes": len(self.mode_rows), "owner": self.owner, "state": buffer_state(self)}
+        return {**self.settings(), "n_modes": len(self.mode_rows), "owner": self.owner, "state": self.state_dict()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         settings, n_modes, tree = state_of_pickle(state, self.target_action_fields)
@@ -188,7 +159,7 @@ class ModeReplayBuffer(PathReplayBuffer):
         self._settings = {*vars(self), "_settings"}
         self.reset()
         self.expect_modes(n_modes)
-        restore_buffer(self, tree)
+        self.load_state_dict(tree)
         self.owner = state["owner"]
 
     def _finish(self, env: int, info: dict[str, Any]) -> Trajectory:
