@@ -224,20 +224,18 @@ class ExplorationBonus:
     def _bonus_mask(self, visited: VisitedSteps) -> th.Tensor:
         """Where novelty is paid, of the N steps that there are."""
         pays = th.from_numpy(visited.first_visits).to(self.device, non_blocking=True)
-        if not self.routes.routes and self._empty_cells():
+        cells = self.known_cells if self.known_cells is not None and self.known_cells.any else None
+        if not self.routes.routes and cells is None:
             return pays
         explores = np.nonzero(visited.present)[0] == EXPLORATORY_GROUP
         if self.routes.routes:
             past = th.from_numpy(explores & self.routes.include(visited.followed))
             pays = pays & ~past.to(self.device, non_blocking=True)
-        if not self._empty_cells() and self.known_cells is not None:
+        if cells is not None:
             # What a mode knows is not new, or explorers would follow it to what lies beyond
             there = th.from_numpy(explores).to(self.device, non_blocking=True)
-            pays = pays & ~(there & self.known_cells.contain(visited.next_positions))
+            pays = pays & ~(there & cells.contain(visited.next_positions))
         return pays
-
-    def _empty_cells(self) -> bool:
-        return self.known_cells is None or not self.known_cells.any
 
     def end_past_routes(self, batch: ModeBatch) -> ModeBatch:
         """

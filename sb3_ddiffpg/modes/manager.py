@@ -131,7 +131,10 @@ class ModeManager:
         followers.follow([indices.get(mode.number) for mode in self.modes])
         self.modes = modes
         self.next_number = max([self.next_number, *(number + 1 for number in indices)])
-        buffer.groups.frozen_modes = {index for index, mode in enumerate(modes) if mode.frozen}
+        self._keep_frozen(buffer)
+
+    def _keep_frozen(self, buffer: ModeReplayBuffer) -> None:
+        buffer.groups.frozen_modes = {index for index, mode in enumerate(self.modes) if mode.frozen}
 
     def expect_unknown(self, n_modes: int, step: int, buffer: ModeReplayBuffer, followers: Followers) -> None:
         """
@@ -175,7 +178,7 @@ class ModeManager:
         if record.frozen != frozen:
             record.frozen = frozen
             self._note(step, "frozen" if frozen else "released", record)
-            buffer.groups.frozen_modes = {index for index, each in enumerate(self.modes) if each.frozen}
+            self._keep_frozen(buffer)
 
     def delete(self, mode: str | int | Mode, step: int, buffer: ModeReplayBuffer, heir: Heir, followers: Followers) -> None:
         """
