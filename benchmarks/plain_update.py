@@ -114,7 +114,8 @@ class PlainUpdate:
         :param batch_size: Transitions over all groups
         """
         model, policy = self.model, self.model.policy
-        n_steps = model.exploration_settings.n_steps, model.mode_settings.n_steps
+        groups = model.exploration_settings, model.mode_settings
+        n_steps = [group.n_steps_beside(model.n_steps) for group in groups]
         batch = model.replay_buffer.sample_modes(batch_size, model.gamma, *n_steps)
         n_groups, n = batch.rows.shape
         positions = model.replay_buffer.features.of_tensors(model.replay_buffer.read_observations(batch.rows[0])[1])

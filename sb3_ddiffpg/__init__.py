@@ -3,6 +3,7 @@
 import sb3_ddiffpg.envs  # noqa: F401 - registers the environments
 from sb3_ddiffpg.buffers import ModeReplayBuffer
 from sb3_ddiffpg.callbacks import ClusteringCallback, EvaluateModesCallback, ModeEvalCallback, ModeFigureCallback
+from sb3_ddiffpg.check import EnvCheck, check_env
 from sb3_ddiffpg.ddiffpg import DDiffPG, DiffusionPolicy
 from sb3_ddiffpg.modes import Mode, ModeTable
 from sb3_ddiffpg.saving import _legacy
@@ -13,12 +14,14 @@ __all__ = [
     "ClusteringCallback",
     "DDiffPG",
     "DiffusionPolicy",
+    "EnvCheck",
     "EvaluateModesCallback",
     "Mode",
     "ModeEvalCallback",
     "ModeFigureCallback",
     "ModeReplayBuffer",
     "ModeTable",
+    "check_env",
 ]
 
 _legacy.install()

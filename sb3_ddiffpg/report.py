@@ -6,16 +6,21 @@ One page about a trained model, without network: ``python -m sb3_ddiffpg.report 
 import argparse
 import json
 import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sb3_ddiffpg.ddiffpg import DDiffPG
-from sb3_ddiffpg.visualization.report import Task, make_report
+from sb3_ddiffpg.envs import import_packages
+from sb3_ddiffpg.evaluation.task import Task
+from sb3_ddiffpg.visualization.report import make_report
 
 
 def _command(given: argparse.Namespace, task: Task) -> str:
     words = ["python", "-m", "sb3_ddiffpg.report", str(given.model), "--output", str(given.output), "--env", task.id]
+    words += ["--gym-packages", *given.gym_packages] if given.gym_packages else []
     if task.kwargs:
         words += ["--env-kwargs", *(f"{name}={json.dumps(value)}" for name, value in task.kwargs.items())]
     for option, value in (
@@ -26,6 +31,21 @@ def _command(given: argparse.Namespace, task: Task) -> str:
         words += [] if value is None else [option, str(value)]
     words += ["--episodes", str(given.episodes), "--seed", str(given.seed), *(["--no-videos"] if given.no_videos else [])]
     return shlex.join(words)
+
+
+@contextmanager
+def _written_or_absent(output: Path) -> Iterator[None]:
+    """The page can be written, and nothing of it is left if it is not."""
+    new = [each for each in (output, *output.parents) if not each.exists()]
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        output.touch()
+        yield
+    except BaseException:
+        for each in new:
+            with suppress(OSError):
+                each.unlink() if each == output else each.rmdir()
+        raise
 
 
 def _keyword(text: str) -> tuple[str, Any]:
@@ -45,7 +65,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m sb3_ddiffpg.report", description="One page about a trained model.")
     parser.add_argument("model", type=Path, help="a .zip that was saved by DDiffPG; loading runs code in it: trust its source")
     parser.add_argument("--output", type=Path, required=True, help="the page, .html")
-    parser.add_argument("--env", help="id of the environment; where the model was trained if left out")
+    parser.add_argument("--env", help="id of the environment, or module:id; where the model was trained if left out")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="modules to import, which register environments")
     parser.add_argument("--env-kwargs", type=_keyword, nargs="+", default=[], metavar="NAME=VALUE", help="values are JSON")
     parser.add_argument("--replay-buffer", type=Path, help="saved with the model: for the dendrogram, and values of an arm")
     parser.add_argument(
@@ -63,18 +84,18 @@ def main(arguments: list[str] | None = None) -> None:
         raise SystemExit(f"--episodes: {given.episodes} given; accepted are whole numbers from 1 up")
     if given.output.is_dir() or given.output.suffix == ".json":
         raise SystemExit(f"--output: {given.output} given; accepted is the path of a page, such as page.html")
-    try:
-        given.output.parent.mkdir(parents=True, exist_ok=True)
-        given.output.touch()
-        model = DDiffPG.load(given.model)
-        if given.replay_buffer is not None:
-            model.load_replay_buffer(given.replay_buffer)
-        task = replace(Task.of(model, given.env, dict(given.env_kwargs)), statistics=given.vec_normalize)
-        task.check(model)
-    except (OSError, ValueError) as error:
-        raise SystemExit(str(error)) from error
-    command = _command(given, task)
-    found = make_report(model, given.output, task, given.episodes, given.seed, not given.no_videos, given.title, command)
+    with _written_or_absent(given.output):
+        try:
+            import_packages(given.gym_packages)
+            model = DDiffPG.load(given.model)
+            if given.replay_buffer is not None:
+                model.load_replay_buffer(given.replay_buffer)
+            task = replace(Task.of(model, given.env, dict(given.env_kwargs)), statistics=given.vec_normalize)
+            task.check(model)
+        except (OSError, ValueError) as error:
+            raise SystemExit(str(error)) from error
+        command = _command(given, task)
+        found = make_report(model, given.output, task, given.episodes, given.seed, not given.no_videos, given.title, command)
     found.save(given.output.with_suffix(".json"))
     print(f"{found}\n\nwrote {given.output} and {given.output.with_suffix('.json')}")
 

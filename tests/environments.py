@@ -63,6 +63,8 @@ class TwoEnds(gym.Env):
         self.observation_space = spaces.Box(-2.0, 2.0, (2,))
         self.action_space = spaces.Box(-1.0, 1.0, (1,))
         self.mode_features = np.array([0])
+        # No test of counts need wait until so much has been seen that cells have a size
+        self.cell_size = self.novelty_cell_size = 0.5
         self.success_key, self.limit = success_key, limit
         self.x, self.steps = 0.0, 0
 

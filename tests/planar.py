@@ -13,6 +13,8 @@ PLANE = spaces.Box(-20.0, 20.0, (2,))
 
 def planar_model(**changes):
     settings = {"mode_features": [0, 1], "buffer_size": 5000, "modes": {"distance_threshold": 2.0, "patience": 0}}
+    if "kwargs" not in changes.get("novelty", {}):
+        settings["novelty"] = {"kwargs": {"cell_size": 0.5}}
     return small_model(AnySpaces(PLANE), **merged(settings, changes))
 
 

@@ -71,17 +71,19 @@ class MlpActorPolicy(BaselinePolicy):
         self._constructor.update(actor_kwargs)
 
 
-def names_of(policy_class: type[BasePolicy]) -> dict[str, type[BasePolicy]]:
+def names_of(policy_class: type[BasePolicy], for_images: type[BasePolicy] | None = None) -> dict[str, type[BasePolicy]]:
     """
     :param policy_class: A baseline's policy, which takes any observations
-    :return: SB3's names for it
+    :param for_images: The same with a convolution, if there is one
+    :return: SB3's names for them
     """
-    return dict.fromkeys(("MlpPolicy", "MultiInputPolicy"), policy_class)
+    names = dict.fromkeys(("MlpPolicy", "MultiInputPolicy"), policy_class)
+    return names if for_images is None else {**names, "CnnPolicy": for_images}
 
 
 class Baseline(ActorCriticAlgorithm):
     """
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
+    :param policy: ``"MlpPolicy"``, ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param actor_tau: Soft update coefficient of a target actor, which acts in the Bellman target; None: the actor itself does
     :param kwargs: Of ``ActorCriticAlgorithm``

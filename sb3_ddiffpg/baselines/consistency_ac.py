@@ -7,6 +7,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
@@ -123,13 +124,19 @@ class ConsistencyActorPolicy(BaselinePolicy):
         self._constructor.update(actor_kwargs)
 
 
+class CnnConsistencyActorPolicy(ConsistencyActorPolicy):
+    """``ConsistencyActorPolicy`` for images, which go through SB3's ``NatureCNN``."""
+
+    default_features_extractor = NatureCNN
+
+
 class ConsistencyAC(Baseline):
     """
     Consistency models as a policy class (Ding and Jin, 2024, https://arxiv.org/abs/2309.16984), here online: the actor
     maximises the smaller of the critics; with ``consistency_coef`` also the consistency loss on the buffer's actions (1 in the
     original, which is offline; 0 online).
 
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
+    :param policy: ``"MlpPolicy"``, ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param n_diffusion_steps: Evaluations of the network for one action
     :param consistency_coef: Factor of the consistency loss
@@ -138,7 +145,7 @@ class ConsistencyAC(Baseline):
     :param kwargs: Of ``Baseline`` and ``ActorCriticAlgorithm``
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(ConsistencyActorPolicy)
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(ConsistencyActorPolicy, CnnConsistencyActorPolicy)
     accepted: ClassVar[dict[str, Accepted]] = {
         "n_diffusion_steps": at_least(1),
         "consistency_coef": NOT_NEGATIVE,

@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_ddiffpg.baselines.baseline import Baseline, names_of
-from sb3_ddiffpg.baselines.dipo import DiffusionActorPolicy
+from sb3_ddiffpg.baselines.dipo import CnnDiffusionActorPolicy, DiffusionActorPolicy
 from sb3_ddiffpg.buffers.batch import ModeBatch
 from sb3_ddiffpg.common.actor_critic import Metrics
 from sb3_ddiffpg.serialization.safetensors_tree import Count
@@ -22,7 +22,7 @@ class DiffusionQL(Baseline):
     ``bc_coef`` times the denoising loss of the buffer's actions (1 in the original, 0 online). It acts with one of
     ``n_candidates`` actions, drawn by the softmax of their values.
 
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
+    :param policy: ``"MlpPolicy"``, ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param n_diffusion_steps: Number of diffusion steps T
     :param noise_schedule: ``"vp"`` as in the paper, or ``"cosine"``
@@ -35,7 +35,7 @@ class DiffusionQL(Baseline):
     :param kwargs: Of ``Baseline`` and ``ActorCriticAlgorithm``
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(DiffusionActorPolicy)
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(DiffusionActorPolicy, CnnDiffusionActorPolicy)
     target_networks: ClassVar[dict[str, str]] = {"actor_target": "actor"}  # it acts by the target critics
     accepted: ClassVar[dict[str, Accepted]] = {
         **dict.fromkeys(("n_diffusion_steps", "n_candidates", "average_freq"), at_least(1)),

@@ -4,6 +4,7 @@ from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import NatureCNN
 from torch import nn
 
 from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, FifoReplayBuffer, names_of
@@ -59,6 +60,12 @@ class DiffusionActorPolicy(BaselinePolicy):
         self._constructor.update(actor_kwargs)
 
 
+class CnnDiffusionActorPolicy(DiffusionActorPolicy):
+    """``DiffusionActorPolicy`` for images, which go through SB3's ``NatureCNN``."""
+
+    default_features_extractor = NatureCNN
+
+
 @registered("sb3_ddiffpg.baselines.dipo.TargetActionReplayBuffer")
 class TargetActionReplayBuffer(FifoReplayBuffer):
     """A ``FifoReplayBuffer`` with one target action beside each action."""
@@ -75,7 +82,7 @@ class DIPO(Baseline):
     DDiffPG's ascent. The original: ``n_diffusion_steps=100, actor_tau=0.005, own_policy_batch=True, total_gradient_ratio=0.3,
     target_action=dict(n_steps=20, learning_rate=0.03)``.
 
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
+    :param policy: ``"MlpPolicy"``, ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param n_diffusion_steps: Number of diffusion steps T
     :param target_action: How target actions climb the critics, see ``TargetActionSettings``
@@ -85,7 +92,7 @@ class DIPO(Baseline):
     :param kwargs: Of ``Baseline`` and ``ActorCriticAlgorithm``
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(DiffusionActorPolicy)
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(DiffusionActorPolicy, CnnDiffusionActorPolicy)
     default_replay_buffer_class = TargetActionReplayBuffer
     settings_groups: ClassVar[tuple[type[Settings], ...]] = (*Baseline.settings_groups, TargetActionSettings)
     accepted: ClassVar[dict[str, Accepted]] = {

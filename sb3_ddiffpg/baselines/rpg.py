@@ -14,9 +14,9 @@ from torch.nn import functional as F
 
 from sb3_ddiffpg.baselines.baseline import FifoReplayBuffer, names_of
 from sb3_ddiffpg.baselines.entropy_tuning import EntropyTuning
-from sb3_ddiffpg.baselines.rpg_policy import RPGPolicy
+from sb3_ddiffpg.baselines.rpg_policy import CnnRPGPolicy, RPGPolicy
 from sb3_ddiffpg.baselines.world_model import WorldModel
-from sb3_ddiffpg.buffers.trajectory import Trajectory
+from sb3_ddiffpg.buffers.trajectory import StepRecord
 from sb3_ddiffpg.common.actor_critic import CUT_VALUES, Metrics
 from sb3_ddiffpg.exploration.settings import NoveltySettings
 from sb3_ddiffpg.networks.policies import average_networks
@@ -95,7 +95,7 @@ class RPG(EntropyTuning):
     plus the entropy of its actions and what they tell about z, so that different z act differently. Deviations are listed in
     ``docs/baselines.md``.
 
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
+    :param policy: ``"MlpPolicy"``, ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param n_steps: Steps H of rollouts in the model, and of the segments from which it learns
     :param gae_lambda: Weight lambda of longer returns
@@ -114,7 +114,7 @@ class RPG(EntropyTuning):
     """
 
     default_replay_buffer_class = FifoReplayBuffer
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(RPGPolicy)
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(RPGPolicy, CnnRPGPolicy)
     settings_groups: ClassVar[tuple[type[Settings], ...]] = (ScalarCriticSettings, NoveltySettings)
     accepted: ClassVar[dict[str, Accepted]] = {
         "gae_lambda": SHARE,
@@ -174,7 +174,7 @@ class RPG(EntropyTuning):
 
     def _policy_arguments(self) -> dict[str, Any]:
         critic = self.critic_settings
-        return {"latent_dim": self.latent_dim, "n_critics": critic.n_critics, "support": (critic.v_min, critic.v_max)}
+        return {"latent_dim": self.latent_dim, "n_critics": critic.n_critics, "support": critic.support}
 
     # ------------------------------------------------------------------ learning
 
@@ -246,7 +246,7 @@ class RPG(EntropyTuning):
         with th.no_grad():
             next_states = policy.encode(segments.next_observations, target=True)
             returns = self._imagine(policy.model_target, next_states, latents.repeat_interleave(horizon, 0))[0]
-            low, high = self.critic_settings.v_min, self.critic_settings.v_max
+            low, high = self.critic_settings.support
             metrics[CUT_VALUES].append((returns >= high).float().mean())
             returns = returns.clamp(low, high).view(n, horizon)
             next_states = next_states.view(n, horizon, -1)
@@ -303,6 +303,6 @@ class RPG(EntropyTuning):
     def _training_actions(self) -> np.ndarray:
         return self.policy.predict(self._last_obs, latents=self.episode_latents.values)[0]  # type: ignore[arg-type]
 
-    def _on_episodes_end(self, finished: list[tuple[int, Trajectory]]) -> None:
-        super()._on_episodes_end(finished)
-        self.episode_latents.draw([env for env, _ in finished], self.policy)
+    def _on_episodes_end(self, record: StepRecord) -> None:
+        super()._on_episodes_end(record)
+        self.episode_latents.draw([env for env, _ in record.finished], self.policy)

@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
+    NatureCNN,
     create_mlp,
     get_actor_critic_arch,
 )
@@ -16,7 +17,6 @@ from torch import nn
 
 from sb3_ddiffpg.baselines.sac_c51 import GaussianActor
 from sb3_ddiffpg.baselines.world_model import WorldModel
-from sb3_ddiffpg.networks.extractors import default_extractor
 from sb3_ddiffpg.networks.policies import SavablePolicy
 from sb3_ddiffpg.utils.observations import batch_size
 
@@ -116,7 +116,7 @@ class RPGPolicy(SavablePolicy):
         super().__init__(
             observation_space,
             action_space,
-            features_extractor_class or default_extractor(observation_space, features_extractor_kwargs),
+            features_extractor_class,
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
@@ -254,3 +254,9 @@ class RPGPolicy(SavablePolicy):
         self.model.train(mode)
         self.inference.train(mode)
         self.training = mode
+
+
+class CnnRPGPolicy(RPGPolicy):
+    """``RPGPolicy`` for images, which go through SB3's ``NatureCNN``."""
+
+    default_features_extractor = NatureCNN

@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import create_mlp
+from stable_baselines3.common.torch_layers import NatureCNN, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
@@ -89,6 +89,12 @@ class GaussianActorPolicy(MlpActorPolicy):
         self.log_entropy_coef = nn.Parameter(th.zeros(()))
 
 
+class CnnGaussianActorPolicy(GaussianActorPolicy):
+    """``GaussianActorPolicy`` for images, which go through SB3's ``NatureCNN``."""
+
+    default_features_extractor = NatureCNN
+
+
 @dataclass(frozen=True, kw_only=True)
 class SACCriticSettings(CriticSettings):
     """``CriticSettings``, but for the default of the noise in the target: SAC's policy has its own."""
@@ -101,7 +107,7 @@ class SACC51(EntropyTuning, Baseline):
     SAC (Haarnoja et al., 2018, https://arxiv.org/abs/1812.05905) with C51 critics and NovelD; the entropy is part of the
     projected target.
 
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
+    :param policy: ``"MlpPolicy"``, ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param entropy_learning_rate: As in ``EntropyTuning``
     :param initial_entropy_coef: As there
@@ -109,7 +115,7 @@ class SACC51(EntropyTuning, Baseline):
     """
 
     policy: GaussianActorPolicy
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(GaussianActorPolicy)
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(GaussianActorPolicy, CnnGaussianActorPolicy)
     settings_groups: ClassVar[tuple[type[Settings], ...]] = (SACCriticSettings, NoveltySettings)
 
     def __init__(

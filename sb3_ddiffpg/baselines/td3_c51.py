@@ -6,7 +6,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import create_mlp
+from stable_baselines3.common.torch_layers import NatureCNN, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
@@ -59,19 +59,25 @@ class TanhActorPolicy(MlpActorPolicy):
     actor_class = TanhActor
 
 
+class CnnTanhActorPolicy(TanhActorPolicy):
+    """``TanhActorPolicy`` for images, which go through SB3's ``NatureCNN``."""
+
+    default_features_extractor = NatureCNN
+
+
 class TD3C51(Baseline):
     """
     TD3 (Fujimoto et al., 2018, https://arxiv.org/abs/1802.09477) with C51 critics and NovelD. As in the DDiffPG paper's
     comparison the actor climbs the smaller of both critics at every update. What else differs from TD3, and by which arguments
     it need not, is listed in ``docs/baselines.md``.
 
-    :param policy: ``"MlpPolicy"``, ``"MultiInputPolicy"`` (dict observations) or a class
+    :param policy: ``"MlpPolicy"``, ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param policy_delay: Updates of the critics for each of the actor and of the target networks
     :param kwargs: Of ``Baseline`` and ``ActorCriticAlgorithm``
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(TanhActorPolicy)
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = names_of(TanhActorPolicy, CnnTanhActorPolicy)
     accepted: ClassVar[dict[str, Accepted]] = {"policy_delay": at_least(1)}
     _counters: ClassVar[dict[str, Any]] = {"_n_critic_updates": Count}
 

@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_ddiffpg.buffers.features import ModeFeatures
+
 # What those held beside settings
 _RECORDS = {
     *(
@@ -37,6 +39,8 @@ def state_of_pickle(state: dict[str, Any], fields: tuple[str, ...]) -> tuple[dic
             state["state"],
         )
     settings = {name: each for name, each in state.items() if name not in _RECORDS}
+    settings["features"] = ModeFeatures(state["observation_space"], state["features"].selection)
+    settings["standardize"] = None
     settings["new_route_share"] = state["new_way_share"]
     # All buffers had them then; of those without modes this is the one that an algorithm may go on with
     settings["target_action_fields"] = fields or ("exploratory_target_actions",)

@@ -2,9 +2,9 @@
 
 from collections import deque
 
-from sb3_ddiffpg.buffers.trajectory import NO_MODE, Trajectory
+from sb3_ddiffpg.buffers.trajectory import NO_MODE, PAST_GOAL, Trajectory
 
-#: Index of a mode (or ``NO_MODE``), and whether its trajectories reached the goal by its own route
+#: Index of a mode (or ``NO_MODE``, or ``PAST_GOAL``), and whether its trajectories reached the goal by its own route
 Key = tuple[int, bool]
 
 
@@ -62,9 +62,28 @@ class TrajectoryGroups:
         :param success: Goal-reached or failed ones (and those that reached it off their mode's route)
         :return: Those in use, in order of finishing
         """
-        found = [each for key, group in self.members.items() if key[1] == success for each in group]
+        found = [each for key, group in self.members.items() if key[1] == success and key[0] != PAST_GOAL for each in group]
         return sorted(found, key=lambda trajectory: trajectory.serial)
 
-    def clear(self) -> None:
-        """Forget those in use; retired ones stay."""
+    def past_goals(self) -> list[Trajectory]:
+        """
+        :return: What episodes did after their goals, in order of finishing
+        """
+        return list(self.members.get((PAST_GOAL, False), ()))
+
+    def take_back_successes(self) -> None:
+        """None of the trajectories has reached a goal: they are failures of their modes."""
+        for trajectory in self.retired:
+            trajectory.success = False
+        members = [each for group in self.members.values() for each in group]
         self.members, self.n_rows = {}, {}
+        for trajectory in sorted(members, key=lambda trajectory: trajectory.serial):
+            trajectory.success = False
+            self.insert(trajectory)
+
+    def clear(self) -> None:
+        """Forget those in use by modes, or that may be; the others stay."""
+        past = self.past_goals()
+        self.members, self.n_rows = {}, {}
+        for trajectory in past:
+            self.insert(trajectory)

@@ -97,6 +97,8 @@ class ModeReplayBuffer(PathReplayBuffer):
         self.mode_rows: list[RowSet] = []
         #: Of trajectories that reached a goal by a route of which a mode has not its fill
         self.new_route_rows = np.empty(0, dtype=np.int32)
+        #: Indices of modes that came of successes which were taken back; they end with the next clustering
+        self.unfounded_modes: set[int] = set()
 
     def _step_fields(self) -> Fields:
         action = ((self.action_dim,), np.float32)
@@ -162,10 +164,18 @@ class ModeReplayBuffer(PathReplayBuffer):
         self.load_state_dict(tree)
         self.owner = state["owner"]
 
-    def _finish(self, env: int, info: dict[str, Any]) -> Trajectory:
-        trajectory = super()._finish(env, info)
+    def _store(self, env: int, info: dict[str, Any]) -> Trajectory:
+        trajectory = super()._store(env, info)
         self.goals[trajectory.rows[-1]] = trajectory.success
         return trajectory
+
+    def _take_back_successes(self) -> None:
+        taken = self.trajectories(success=True)
+        self.unfounded_modes.update(each.mode for each in taken if each.mode != NO_MODE)
+        super()._take_back_successes()
+        self.goals[:] = False
+        self.route_novelty[:] = 0.0
+        self.new_route_rows = self.new_route_rows[:0]
 
     def _evict(self) -> Trajectory:
         trajectory = super()._evict()
@@ -220,7 +230,8 @@ class ModeReplayBuffer(PathReplayBuffer):
         for name in ("success_key", *_MODE_SETTINGS):
             setattr(self, name, getattr(other, name))
         self.move_storage(other.storage_device)
-        self.success_rule.success_key = other.success_key
+        if self.success_rule.success_key != other.success_key:
+            self.success_rule.success_key, self.success_rule.has_key = other.success_key, False
         return changed
 
     def assign_modes(
@@ -245,6 +256,7 @@ class ModeReplayBuffer(PathReplayBuffer):
         :param abandoned: Further goal-reached trajectories, which retire to exploration
         """
         self.groups.clear()
+        self.unfounded_modes = {new for new, old in enumerate(parents) if old in self.unfounded_modes}
         self.mode_rows = [self.make_row_set() for _ in parents]
         stays: list[Trajectory] = []
         goes: list[Trajectory] = list(abandoned)
@@ -298,7 +310,8 @@ class ModeReplayBuffer(PathReplayBuffer):
         """
         :return: Finished ones but those that took a new route to a goal
         """
-        finished = [*self.trajectories(success=True), *self.trajectories(success=False), *self.groups.retired]
+        used = *self.trajectories(success=True), *self.trajectories(success=False)
+        finished = [*used, *self.groups.retired, *self.groups.past_goals()]
         return [each for each in finished if self.route_novelty[each.rows[-1]] == 0]
 
     def mark_off_route(self, trajectory: Trajectory, members: list[Trajectory]) -> None:
@@ -377,6 +390,7 @@ class ModeReplayBuffer(PathReplayBuffer):
             gammas,
             explore_beyond_goals=self.explore_beyond_goals,
             new_routes_pay=self.new_route_share > 0,
+            goals_are_told=self.has_success_signal,
         )
         # What led away from the route is for the critic to judge, not for the policy to follow
         imitated = active[:, None] & ~notes["off_mode_success"][..., 0]

@@ -6,12 +6,15 @@ from typing import Any
 import numpy as np
 
 from sb3_ddiffpg.buffers.batch import VisitedSteps
+from sb3_ddiffpg.buffers.features import ModeFeatures
 from sb3_ddiffpg.buffers.trajectory import Trajectory
 from sb3_ddiffpg.buffers.trajectory_buffer import TrajectoryReplayBuffer
 from sb3_ddiffpg.clustering.distance_cache import DistanceCache
 from sb3_ddiffpg.clustering.paths import LOOP_SHARE, N_PATH_POINTS, comparable_path
 from sb3_ddiffpg.utils.settings import FLAG, NOT_NEGATIVE, Accepted, at_least
 
+# Steps from which positions are standardised, at most
+_MEASURED = 50_000
 _LENGTH = Accepted("be a positive and finite number", lambda value: _is_real(value) and 0 < value < np.inf).or_none()
 
 
@@ -30,6 +33,8 @@ class PathReplayBuffer(TrajectoryReplayBuffer):
     :param compared_length: Arc length of a path's end, without its loops, that alone is compared; None: all of it. What an
         explorer did before it took a route says nothing about the route. In the unit of the mode features, of a whole
         observation in standard deviations
+    :param standardize: Whether positions are divided by their standard deviation where paths are compared; None: those of a
+        whole observation. Not those that have one unit, in which distances are given
     :param loop_share: Radius within which a path that comes back has made a loop, as a share of the path's extent
     :param kwargs: Of ``TrajectoryReplayBuffer``
     :raises ValueError: If an argument is out of its range
@@ -41,6 +46,7 @@ class PathReplayBuffer(TrajectoryReplayBuffer):
         n_path_points: int = N_PATH_POINTS,
         normalize_distances: bool = True,
         compared_length: float | None = None,
+        standardize: bool | None = None,
         loop_share: float = LOOP_SHARE,
         **kwargs: Any,
     ) -> None:
@@ -48,18 +54,23 @@ class PathReplayBuffer(TrajectoryReplayBuffer):
             ("n_path_points", at_least(2), n_path_points),
             ("normalize_distances", FLAG, normalize_distances),
             ("compared_length", _LENGTH, compared_length),
+            ("standardize", FLAG.or_none(), standardize),
             ("loop_share", NOT_NEGATIVE, loop_share),
         ):
             accepted.check(name, value)
         self.n_path_points = n_path_points
         self.normalize_distances = normalize_distances
         self.compared_length = None if compared_length is None else float(compared_length)
-        self.loop_share = loop_share
+        self.standardize, self.loop_share = standardize, loop_share
         super().__init__(*args, **kwargs)
 
     def reset(self) -> None:
         """Forget everything and release the storage."""
         super().reset()
+        if self.standardize is None:
+            self.standardize = self.features.whole_observation
+        unit = np.ones(self.features.dim, dtype=np.float32)  # declared positions keep theirs
+        self.feature_scale = None if self.standardize else unit
         self.distances = DistanceCache(self.normalize_distances)
 
     # ------------------------------------------------------------------ windows
@@ -103,6 +114,15 @@ class PathReplayBuffer(TrajectoryReplayBuffer):
 
     # ------------------------------------------------------------------ paths
 
+    def episodes(self) -> list[np.ndarray]:
+        """
+        :return: Rows of every stored episode, in order, also of those in progress
+        """
+        used = *self.trajectories(success=True), *self.trajectories(success=False)
+        finished = [*used, *self.groups.retired, *self.groups.past_goals()]
+        running = [self.running.of(env) for env in np.flatnonzero(self.running.lengths).tolist()]
+        return [*(each.rows for each in finished), *running]
+
     def reached(self, rows: np.ndarray) -> np.ndarray:
         """
         :param rows: Shape [N]
@@ -117,10 +137,42 @@ class PathReplayBuffer(TrajectoryReplayBuffer):
         :return: What positions are divided by where paths are compared, [dim]
         """
         if self.feature_scale is None:
-            rows = self.stored_rows.rows[: min(self.stored_rows.size, 50_000)]
-            deviation = self.positions(self.steps, "observations", rows).std(axis=0)
-            self.feature_scale = np.where(deviation > 1e-6, deviation, 1.0).astype(np.float32)
+            self.feature_scale = self._deviations()
         return self.feature_scale
+
+    def _deviations(self) -> np.ndarray:
+        """Standard deviation of each mode feature, [dim]; of what has not moved its size, whatever the unit."""
+        rows = self.stored_rows.rows[: self.stored_rows.size]
+        positions = self.positions(self.steps, "observations", rows[:: len(rows) // _MEASURED + 1]).astype(np.float64)
+        size = np.abs(positions).max(axis=0)
+        moved = positions.std(axis=0) > 1e-6 * size
+        return np.where(moved, positions.std(axis=0), np.where(size > 0, size, 1.0)).astype(np.float32)
+
+    def use_features(self, selection: Any) -> None:
+        """
+        Compare paths in other mode features from now on.
+
+        :param selection: See ``ModeFeatures``
+        :raises ValueError: If it does not fit the observation space
+        """
+        self.features = ModeFeatures(self.observation_space, selection)
+        self.standardize, self.feature_scale = True, None
+        self.forget_paths()
+
+    def review_scale(self) -> bool:
+        """
+        Standardise anew if the run has gone so much farther that one component of the positions would decide all.
+
+        :return: Whether paths are compared in another way now
+        """
+        if not self.standardize or self.feature_scale is None:
+            return False
+        ratios = self._deviations() / self.feature_scale
+        if 0.5 < ratios.min() and ratios.max() < 2.0:
+            return False
+        self.feature_scale = self._deviations()
+        self.forget_paths()
+        return True
 
     def forget_paths(self) -> None:
         """Paths are compared in another way now."""

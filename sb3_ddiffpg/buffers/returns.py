@@ -31,6 +31,7 @@ def group_returns(
     gammas: np.ndarray,
     explore_beyond_goals: bool,
     new_routes_pay: bool,
+    goals_are_told: bool = True,
 ) -> GroupReturns:
     """
     :param windows: Rows from each transition on, -1 where they end, [G, n, n_steps]; the exploratory group first
@@ -39,6 +40,7 @@ def group_returns(
     :param gammas: Discount factor of each group, [G]
     :param explore_beyond_goals: Whether a goal does not end the exploratory group's returns
     :param new_routes_pay: Whether that group is paid for goals by new routes
+    :param goals_are_told: Whether goals are the environment's, and not the ends of the best episodes
     :return: The returns
     """
     present = windows >= 0
@@ -47,15 +49,27 @@ def group_returns(
     lost = np.logical_or.accumulate(notes["off_route"] & present, axis=-1)
     lost[EXPLORATORY_GROUP] = False
     powers = gammas[..., None] ** np.arange(windows.shape[-1], dtype=np.float32)
+    terminates = notes["dones"] & ~notes["timeouts"]
+    paid = notes["goals"] & (notes["route_novelty"] > 0) & new_routes_pay
+    # At a goal the environment may go on. A mode's return ends there all the same: no transition from beyond is the mode's,
+    # so its critics would learn from their own guesses there, and climb without end. It is worth what the goal pays for ever,
+    # as to one who stays: less, and it would be better to linger before it where rewards are dense. One that pays nothing, or
+    # takes, is worth no more than that: what each step on the way has cost is over
+    reached = notes["goals"] & ~terminates & goals_are_told
+    stays = reached & (rewards > 0) & (gammas[..., None] < 1)
+    stays[EXPLORATORY_GROUP] = False
+    rewards = np.where(stays, rewards / np.maximum(1 - gammas, 1e-6)[..., None], rewards)
+    # Explorers go on with the environment. But a goal for which they are paid ends what exploring is worth, or it would be
+    # paid again and again
+    reached[EXPLORATORY_GROUP] &= paid[EXPLORATORY_GROUP]
+    if explore_beyond_goals:
+        # Any other that ended it would be the one place that explorers keep away from
+        terminates[EXPLORATORY_GROUP] &= ~(notes["goals"] & ~paid)[EXPLORATORY_GROUP]
+
     rewards = np.where(present & ~lost, rewards, 0.0) * powers
     lengths = present.sum(axis=-1)
     ends = lengths[..., None] - 1
-    ended = np.take_along_axis(notes["dones"] & ~notes["timeouts"], ends, axis=-1)[..., 0]
-    if explore_beyond_goals:
-        # A goal that ended what exploring is worth would be the one place that explorers keep away from. One that is paid
-        # for ends it, or it would be paid again and again
-        unpaid = notes["goals"] & ~((notes["route_novelty"] > 0) & new_routes_pay)
-        ended[EXPLORATORY_GROUP] &= ~np.take_along_axis(unpaid, ends, axis=-1)[EXPLORATORY_GROUP, :, 0]
+    ended = np.take_along_axis(terminates | reached, ends, axis=-1)[..., 0]
     return GroupReturns(
         rewards=rewards.sum(axis=-1),
         discounts=gammas**lengths * ~(ended | lost.any(axis=-1)),
@@ -65,10 +79,17 @@ def group_returns(
     )
 
 
-def discounted_returns(rewards: np.ndarray, gamma: float) -> np.ndarray:
+def discounted_returns(rewards: np.ndarray, gamma: float, then: str = "ends") -> np.ndarray:
     """
     :param rewards: Of an episode, shape [length]
     :param gamma: Discount factor
+    :param then: What comes after it: it ``"ends"``; it ``"goes on"`` as it was, with the mean of as many of its last rewards
+        as count; or it ``"stays"`` at its goal, see ``group_returns``
     :return: From each step on, the last first, same shape
     """
-    return lfilter([1.0], [1.0, -gamma], rewards[::-1])
+    latest_first = np.array(rewards[::-1], dtype=np.float64)
+    if gamma < 1 and then == "goes on":
+        latest_first[0] += gamma / (1 - gamma) * latest_first[: round(1 / (1 - gamma))].mean()
+    elif gamma < 1 and then == "stays" and latest_first[0] > 0:
+        latest_first[0] /= 1 - gamma
+    return lfilter([1.0], [1.0, -gamma], latest_first)

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from sb3_ddiffpg.buffers.storage import Fields, HostRows
-from sb3_ddiffpg.buffers.trajectory import NO_MODE, Trajectory
+from sb3_ddiffpg.buffers.trajectory import PAST_GOAL, Trajectory
 from sb3_ddiffpg.serialization.safetensors_tree import Count, check_array, convert
 
 
@@ -58,6 +58,10 @@ class _Buffer(msgspec.Struct, forbid_unknown_fields=True):
     compared_length: float | None = None
     loop_share: float | None = None
     normalize_distances: bool | None = None
+    episode_steps: np.ndarray | None = None
+    goal_steps: np.ndarray | None = None
+    goal_labels: list[str | None] | None = None
+    unfounded_modes: list[int] | None = None
 
 
 # Settings on which they depend, beside ``n_path_points``
@@ -82,6 +86,7 @@ def buffer_state(buffer: Any) -> dict[str, Any] | None:
     if not buffer.pos:
         return None
     groups, running, retired = buffer.groups.members, buffer.running, buffer.groups.retired
+    rule = buffer.success_rule
     trajectories = [each for group in groups.values() for each in group] + list(retired)
     places = {id(each): i for i, each in enumerate(trajectories)}
 
@@ -94,7 +99,7 @@ def buffer_state(buffer: Any) -> dict[str, Any] | None:
         "parts": [part.dump(buffer.pos) for part in buffer.parts],
         "full": buffer.full,
         "stored": buffer.stored_rows.rows[: buffer.stored_rows.size],
-        "freed": buffer.freed(),
+        "freed": buffer.free_rows.all(),
         "running": running.all_rows(),
         "running_length": running.lengths,
         "running_return": running.returns,
@@ -111,8 +116,12 @@ def buffer_state(buffer: Any) -> dict[str, Any] | None:
         "new_route_rows": buffer.new_route_rows,
         "frozen_modes": sorted(buffer.groups.frozen_modes),
         "n_finished": buffer.n_finished,
-        "has_signal": buffer.success_rule.has_signal,
-        "recent_returns": list(buffer.success_rule.recent_returns),
+        "has_signal": rule.has_signal,
+        "recent_returns": list(rule.recent_returns),
+        "episode_steps": rule.steps,
+        "goal_steps": rule.goal_steps,
+        "goal_labels": list(rule.labels),
+        "unfounded_modes": sorted(buffer.unfounded_modes),
         "owner": buffer.owner,
         "n_path_points": buffer.n_path_points,
         "feature_scale": buffer.feature_scale,
@@ -148,7 +157,7 @@ def restore_buffer(buffer: Any, tree: Any) -> None:
         part.restore(raw)
     buffer.pos, buffer.full = len(state.parts[0]), state.full
     buffer.stored_rows.add(state.stored)
-    buffer.restore_freed(state.freed)
+    buffer.free_rows.restore(state.freed)
     buffer.running.restore(state.running, state.running_length, state.running_return)
     for group in state.groups:
         key, members = (group.mode, group.success), [trajectories[i] for i in group.members]
@@ -160,8 +169,13 @@ def restore_buffer(buffer: Any, tree: Any) -> None:
     buffer.new_route_rows = state.new_route_rows
     buffer.groups.frozen_modes = set(state.frozen_modes)
     buffer.n_finished = state.n_finished
-    buffer.success_rule.has_signal = state.has_signal
-    buffer.success_rule.recent_returns.extend(state.recent_returns)
+    rule = buffer.success_rule
+    rule.has_signal = rule.has_key = state.has_signal
+    rule.recent_returns.extend(state.recent_returns)
+    rule.steps = (state.running_length if state.episode_steps is None else state.episode_steps).copy()
+    if state.goal_steps is not None and state.goal_labels is not None:
+        rule.goal_steps, rule.labels = state.goal_steps.copy(), state.goal_labels
+    buffer.unfounded_modes = set(state.unfounded_modes or ())
     buffer.owner = state.owner
     if state.feature_scale is not None:
         buffer.feature_scale = state.feature_scale
@@ -267,12 +281,14 @@ def _check(buffer: Any, state: _Buffer, trajectories: list[Trajectory]) -> None:
         _check_partition(own, rows, f"rows of mode {mode}, but not of the trajectories that train it")
     next_rows = state.parts[-1].view(_row_dtypes(buffer)[-1])[:, 0]["next_row"][state.stored]
     problems = {
-        "a mode that is not there": any(not NO_MODE <= each.mode < n_modes for each in trajectories),
-        "a trajectory that trains no mode": any(each.trains and each.mode == NO_MODE for each in trajectories),
+        "a mode that is not there": any(not PAST_GOAL <= each.mode < n_modes for each in trajectories),
+        "a trajectory that trains no mode": any(each.trains and each.mode < 0 for each in trajectories),
+        "a success past a goal": any(each.success and each.mode == PAST_GOAL for each in trajectories),
         "two groups of the same": len({(group.mode, group.success) for group in state.groups}) < len(state.groups),
         "a group with another mode's member": any(trajectories[i].mode != g.mode for g in state.groups for i in g.members),
         "new routes that are not stored": not np.isin(state.new_route_rows, state.stored).all(),
         "frozen modes that are not there": not set(state.frozen_modes) <= set(range(n_modes)),
+        "unfounded modes that are not there": not set(state.unfounded_modes or ()) <= set(range(n_modes)),
         "a trajectory from the future": any(each.serial >= state.n_finished for each in trajectories),
         "a number that is not finite": not _finite(buffer, state),
         "a row that is followed by none of its rows": bool(((next_rows < -1) | (next_rows >= pos)).any()),
@@ -318,8 +334,21 @@ def _check_arrays(buffer: Any, state: _Buffer) -> None:
         check_array(array, dtype, shape, f"replay buffer.{name}")
     if (state.running_length < 0).any() or state.running_length.sum() != len(state.running):
         raise ValueError("replay buffer.running: the lengths do not fit the rows")
+    _check_episodes(buffer, state)
     if (np.diff(state.serials) <= 0).any():
         raise ValueError("replay buffer.serials must ascend")
+
+
+def _check_episodes(buffer: Any, state: _Buffer) -> None:
+    """How long the running episodes are, and where they have reached their goals."""
+    steps = state.running_length if state.episode_steps is None else state.episode_steps
+    goals = np.zeros_like(steps) if state.goal_steps is None else state.goal_steps
+    for name, array in (("episode_steps", steps), ("goal_steps", goals)):
+        check_array(array, np.int64, [buffer.n_envs], f"replay buffer.{name}")
+    if (steps < state.running_length).any() or (goals < 0).any() or (goals > steps).any():
+        raise ValueError("replay buffer.episode_steps, goal_steps: accepted are those of episodes as long as the running ones")
+    if state.goal_labels is not None and len(state.goal_labels) != buffer.n_envs:
+        raise ValueError(f"replay buffer.goal_labels: {len(state.goal_labels)} given; accepted are {buffer.n_envs}")
 
 
 def _check_partition(parts: np.ndarray, whole: np.ndarray, problem: str) -> None:

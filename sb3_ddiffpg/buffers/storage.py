@@ -149,6 +149,44 @@ def make_rows(n_rows: int, fields: Fields, device: th.device) -> HostRows | Devi
     return HostRows(n_rows, fields) if device.type == "cpu" else DeviceRows(n_rows, fields, device)
 
 
+class FreeRows:
+    """Stack of rows that were used and are free again."""
+
+    def __init__(self) -> None:
+        self._rows = np.empty(0, dtype=np.int32)
+        self.size = 0
+
+    def add(self, rows: np.ndarray) -> None:
+        """
+        :param rows: That are used no longer, shape [N]
+        """
+        needed = self.size + len(rows)
+        if needed > len(self._rows):
+            self._rows = np.concatenate((self.all(), np.empty(2 * needed, dtype=np.int32)))
+        self._rows[self.size : needed] = rows
+        self.size = needed
+
+    def take(self, n: int) -> np.ndarray:
+        """
+        :param n: How many of those that are there
+        :return: Rows to use, shape [n]
+        """
+        self.size -= n
+        return self._rows[self.size : self.size + n]
+
+    def all(self) -> np.ndarray:
+        """
+        :return: Shape [size]
+        """
+        return self._rows[: self.size]
+
+    def restore(self, rows: np.ndarray) -> None:
+        """
+        :param rows: What ``all`` gave
+        """
+        self._rows, self.size = rows.copy(), len(rows)
+
+
 class RowSet:
     """
     A set of rows that is sampled, extended and reduced in time independent of its size. Sets that never share a row may

@@ -1,225 +1,81 @@
 """Replay buffer that keeps whole trajectories: steps, running and finished episodes, and where they went."""
 
+import warnings
 from typing import Any
 
 import numpy as np
-import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.preprocessing import get_obs_shape
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_ddiffpg.buffers.features import ModeFeatures, Observation
+from sb3_ddiffpg.buffers.features import Observation
 from sb3_ddiffpg.buffers.groups import TrajectoryGroups
+from sb3_ddiffpg.buffers.row_buffer import RowReplayBuffer
 from sb3_ddiffpg.buffers.running import RunningEpisodes
-from sb3_ddiffpg.buffers.storage import Fields, HostRows, RowSet, make_rows, storage_place
+from sb3_ddiffpg.buffers.storage import FreeRows
 from sb3_ddiffpg.buffers.success import SuccessRule
-from sb3_ddiffpg.buffers.trajectory import StepRecord, Trajectory
+from sb3_ddiffpg.buffers.trajectory import PAST_GOAL, StepRecord, Trajectory
 from sb3_ddiffpg.utils.divergence import check_finite
-from sb3_ddiffpg.utils.settings import FLAG
+from sb3_ddiffpg.utils.vec_envs import env_attribute, labels_routes
 
-# Rows are numbered in 32 bits
-MOST_ROWS = 2**31 - 1
+# Steps of a stored part of an episode, at most: beyond the episodes of any common task
+LONGEST_PART = 10_000
 
 
-class TrajectoryReplayBuffer(ReplayBuffer):
+class TrajectoryReplayBuffer(RowReplayBuffer):
     """
-    Transitions live in rows; a finished trajectory owns its rows. When rows run out, ``TrajectoryGroups`` says which
+    A ``RowReplayBuffer`` in which a finished trajectory owns its rows. When rows run out, ``TrajectoryGroups`` says which
     trajectory is evicted.
 
-    Storage is allocated by ``allocate`` or the first ``add``: a model that is loaded to act needs none. What the networks see
-    may live on an accelerator (``storage_device``); what decides which rows are read always stays in the main memory.
-
-    :param buffer_size: Capacity in transitions (over all environments)
-    :param observation_space: Observation space
-    :param action_space: Action space
-    :param device: PyTorch device of the samples
-    :param n_envs: Number of parallel environments
-    :param optimize_memory_usage: Not supported
-    :param handle_timeout_termination: Whether time limits are bootstrapped through
-    :param success_key: Key of ``info`` that marks a success; None reads ``is_success`` or ``success`` and, where neither
-        exists, counts the trajectories whose return is in the top fifth of those seen lately
-    :param storage_device: Where observations and actions live: ``"cpu"``, or ``"auto"``: where the samples go
-    :param mode_features: See ``ModeFeatures``
-    :raises ValueError: If ``buffer_size`` is out of its range or ``optimize_memory_usage`` is asked for
+    :param args: Of ``RowReplayBuffer``
+    :param success_key: Key of ``info`` that marks a success, at any step of an episode; None reads ``is_success`` or
+        ``success`` and, until one is met, counts the trajectories whose return is in the top fifth of those seen lately
+    :param kwargs: Of ``RowReplayBuffer``
+    :raises ValueError: If an argument is out of its range or ``optimize_memory_usage`` is asked for
     """
 
-    # Views of the storage: arrays (tensors where it is on an accelerator), or dicts of such
-    observations: Any
-    next_observations: Any
-    actions: Any
-    rewards: np.ndarray
-    dones: np.ndarray
-    timeouts: np.ndarray
-    next_row: np.ndarray
-    #: For the exploration bonus, which writes them: places that an episode saw first, number of the known route that it had
-    #: come along by then, and whether its visits count
-    first_visits: np.ndarray
-    followed: np.ndarray
-    counted: np.ndarray
+    #: What positions are divided by where paths are compared, [dim]; None until they are
+    feature_scale: np.ndarray | None
+    #: Once for each filling of the buffer
+    _warned_parts: bool = False
 
-    def __init__(
-        self,
-        buffer_size: int,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        device: th.device | str = "auto",
-        n_envs: int = 1,
-        optimize_memory_usage: bool = False,
-        handle_timeout_termination: bool = True,
-        success_key: str | None = None,
-        storage_device: th.device | str = "cpu",
-        mode_features: Any = None,
-    ) -> None:
-        if optimize_memory_usage:
-            raise ValueError("optimize_memory_usage=True is not supported: trajectories do not lie in one ring")
-        if not 1 <= buffer_size <= MOST_ROWS:
-            raise ValueError(f"buffer_size must be from 1 to {MOST_ROWS}, got {buffer_size}")
-        # Not ReplayBuffer's constructor: it would allocate a ring per environment
-        super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
-        self.optimize_memory_usage = False
-        FLAG.check("handle_timeout_termination", handle_timeout_termination)
-        self.handle_timeout_termination = handle_timeout_termination
+    def __init__(self, *args: Any, success_key: str | None = None, **kwargs: Any) -> None:
         self.success_key = success_key
-        self.features = ModeFeatures(observation_space, mode_features)
-        self.storage_device = storage_place(storage_device, self.device)
-        self._settings = {*vars(self), "_settings"}
-        self.reset()
+        super().__init__(*args, **kwargs)
 
     def reset(self) -> None:
         """Forget everything and release the storage."""
         super().reset()
-        for name in set(vars(self)) - self._settings:
-            delattr(self, name)
-        self._allocated = False
-        #: Stack of rows that were used and freed
-        self.free_rows = np.empty(0, dtype=np.int32)
-        self._n_free = 0
+        self.free_rows = FreeRows()
+        #: Steps after which a running episode is stored as a part; None: however long it is, while there is room
+        self.part_length: int | None = None
+        self._parts: list[tuple[int, Trajectory]] = []
         self.running = RunningEpisodes(self.n_envs)
         self.groups = TrajectoryGroups()
         self.n_finished = 0
-        self.success_rule = SuccessRule(self.success_key)
-        #: What positions are divided by where paths are compared, [dim]; None until they are
-        unit = np.ones(self.features.dim, dtype=np.float32)  # declared positions keep theirs
-        self.feature_scale: np.ndarray | None = None if self.features.whole_observation else unit
-
-    def move_storage(self, device: th.device) -> None:
-        """
-        :param device: Where observations and actions live from now on
-        """
-        if device == self.storage_device:
-            return
-        self.storage_device = device
-        if self._allocated:
-            for part in ("steps", "nexts"):
-                old = getattr(self, part)
-                moved = make_rows(self.buffer_size, old.fields, device)
-                moved.restore(old.dump(self.pos))
-                setattr(self, part, moved)
-            self._make_views()
-
-    def _observation_fields(self, name: str) -> Fields:
-        space = self.observation_space
-        parts = {f"{name}/{key}": each for key, each in space.items()} if isinstance(space, spaces.Dict) else {name: space}
-        fields: Fields = {}
-        for part, each in parts.items():
-            shape: Any = get_obs_shape(each)
-            fields[part] = shape, self._maybe_cast_dtype(each.dtype)
-        return fields
-
-    def _step_fields(self) -> Fields:
-        """What is read at the row of a step."""
-        return {**self._observation_fields("observations"), "actions": ((self.action_dim,), np.float32)}
-
-    def _note_fields(self) -> Fields:
-        """What is read at all rows of a window."""
-        own: Fields = {"rewards": ((), np.float32), "next_row": ((), np.int32), "dones": ((), bool), "timeouts": ((), bool)}
-        return {**own, "followed": ((), np.int32), "first_visits": ((), bool), "counted": ((), bool)}
-
-    def part_fields(self) -> tuple[Fields, Fields, Fields]:
-        """
-        :return: Fields of the three parts of a row: step, next observation, notes
-        """
-        return self._step_fields(), self._observation_fields("next_observations"), self._note_fields()
+        self.success_rule = SuccessRule(self.success_key, self.n_envs)
 
     def claim(self, env: VecEnv) -> None:
         """
-        Claim the memory before training begins. The episodes in progress must fit, or hours later there would be nothing to
-        evict.
+        Claim the memory before training begins. The episodes in progress must fit: those of environments that declare no
+        time limit are stored in parts, if they are long.
 
         :param env: The environments
         :raises ValueError: If the buffer is too small for them, was made for another number, or there is not that much memory
         """
         if self.n_envs != env.num_envs:
             raise ValueError(f"The replay buffer was made for {self.n_envs} environment(s), got {env.num_envs}")
-        try:
-            limit = getattr(env.get_attr("spec", indices=0)[0], "max_episode_steps", None)
-        except AttributeError:
-            limit = None
+        self.success_rule.labelled = labels_routes(env)
+        limit = getattr(env_attribute(env, "spec"), "max_episode_steps", None)
         if limit is not None and self.buffer_size < limit * self.n_envs:
             raise ValueError(
                 f"buffer_size={self.buffer_size} is smaller than one episode of every environment: "
                 f"{self.n_envs} x {limit} steps"
             )
+        self.part_length = self._longest_part() if limit is None else None
         self.allocate()
 
-    def allocate(self) -> None:
-        """
-        Claim the memory, where that has not been done. The system grants most of it only when rows are written.
-
-        :raises ValueError: If there is not that much
-        """
-        if self._allocated:
-            return
-        try:
-            self._allocate()
-        except (MemoryError, th.OutOfMemoryError) as error:
-            raise ValueError(f"buffer_size={self.buffer_size}: there is not so much memory ({error})") from error
-
-    def _allocate(self) -> None:
-        steps, nexts, notes = self.part_fields()
-        self.steps = make_rows(self.buffer_size, steps, self.storage_device)
-        self.nexts = make_rows(self.buffer_size, nexts, self.storage_device)
-        self.notes = HostRows(self.buffer_size, notes)
-        self.stored_rows = RowSet(np.zeros(self.buffer_size, dtype=np.int32))
-        self._make_views()
-        self._allocated = True
-
-    def _make_views(self) -> None:
-        self.observations = self._as_observation(self.steps, "observations")
-        self.next_observations = self._as_observation(self.nexts, "next_observations")
-        self.actions = self.steps["actions"]
-        for name in self._note_fields():
-            setattr(self, name, self.notes[name])
-
-    def _as_observation(self, fields: Any, name: str) -> Any:
-        """One array or tensor, or a dict of them."""
-        if isinstance(self.observation_space, spaces.Dict):
-            return {key: fields[f"{name}/{key}"] for key in self.observation_space.spaces}
-        return fields[name]
-
-    @property
-    def storage_bytes(self) -> int:
-        """Size of the storage."""
-        return sum(part.nbytes for part in (*self.parts, self.stored_rows.position))
-
-    @property
-    def parts(self) -> tuple[Any, ...]:
-        """What is stored of all rows: step, next observation, notes."""
-        return self.steps, self.nexts, self.notes
-
-    def settings(self) -> dict[str, Any]:
-        """
-        :return: What the buffer was made with, by attribute
-        """
-        return {name: value for name, value in vars(self).items() if name in self._settings}
-
-    def size(self) -> int:
-        """
-        :return: Number of stored transitions
-        """
-        return self.stored_rows.size if self._allocated else 0
+    def _longest_part(self) -> int:
+        """So that running episodes fill half of the buffer at most."""
+        return max(1, min(self.buffer_size // (2 * self.n_envs), LONGEST_PART))
 
     def _take_rows(self, n: int) -> np.ndarray:
         """Rows for n transitions: unused ones first, then freed ones, then those of an evicted trajectory."""
@@ -228,41 +84,29 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         self.pos += unused
         if unused < n:
             self.full = True
-            while self._n_free < n - unused:
+            while self.free_rows.size < n - unused:
                 self._evict()
-            self._n_free -= n - unused
-            rows = np.concatenate((rows, self.free_rows[self._n_free : self._n_free + n - unused]))
+            rows = np.concatenate((rows, self.free_rows.take(n - unused)))
         return rows
 
     def _evict(self) -> Trajectory:
         trajectory = self.groups.pop_oldest()
+        if trajectory is None and self.running.lengths.any():
+            self.part_length = self._longest_part()  # whatever the environments have declared
+            self._cut(int(self.running.lengths.argmax()))
+            trajectory = self.groups.pop_oldest()
         if trajectory is None:
             raise ValueError(
-                f"buffer_size={self.buffer_size} transitions is too small: the unfinished episodes of {self.n_envs} "
-                "environment(s) fill it. Give at least n_envs times the episode length"
+                f"buffer_size={self.buffer_size} transitions is too small: the last successes of the modes and one step of "
+                f"{self.n_envs} environment(s) fill it"
             )
-        self._free_rows(trajectory.rows)
+        self._parts = [part for part in self._parts if part[1] is not trajectory]
+        self._release(trajectory.rows)
         return trajectory
 
-    def freed(self) -> np.ndarray:
-        """
-        :return: Rows that were used and are free again
-        """
-        return self.free_rows[: self._n_free]
-
-    def restore_freed(self, rows: np.ndarray) -> None:
-        """
-        :param rows: What ``freed`` gave
-        """
-        self.free_rows, self._n_free = rows.copy(), len(rows)
-
-    def _free_rows(self, rows: np.ndarray) -> None:
+    def _release(self, rows: np.ndarray) -> None:
         self.stored_rows.remove(rows)
-        needed = self._n_free + len(rows)
-        if needed > len(self.free_rows):
-            self.free_rows = np.concatenate((self.free_rows[: self._n_free], np.empty(2 * needed, dtype=np.int32)))
-        self.free_rows[self._n_free : needed] = rows
-        self._n_free = needed
+        self.free_rows.add(rows)
 
     def add(  # type: ignore[override]
         self,
@@ -286,21 +130,30 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         :raises ValueError: If a value is not finite (nothing is stored then), or the buffer cannot hold one episode
         """
         self.allocate()
+        said = self.success_rule.read(infos)
         action = np.asarray(action, dtype=np.float32).reshape(self.n_envs, self.action_dim)
         positions = self._check_step(obs, next_obs, action, reward)
+        self._parts = []
         rows = self._take_rows(self.n_envs)
         self._write_rows(rows, obs, next_obs, action, reward, done)
         self.stored_rows.add(rows)
         goes_on, before = self.running.latest()
         self.next_row[before] = rows[goes_on]
-        started = np.flatnonzero(self.running.lengths == 0)
+        started = np.flatnonzero(self.success_rule.steps == 0)
         self.running.extend(rows, reward)
+        had_signal = self.success_rule.has_signal
+        self.success_rule.observe(infos, said)
+        if self.success_rule.has_signal and not had_signal:
+            self._take_back_successes()
 
         finished: list[tuple[int, Trajectory]] = []
         for env in np.flatnonzero(done):
             if self.handle_timeout_termination:
                 self.timeouts[rows[env]] = bool(infos[env].get("TimeLimit.truncated", False))
             finished.append((int(env), self._finish(int(env), infos[env])))
+        if self.part_length is not None:
+            for env in np.flatnonzero(self.running.lengths >= self.part_length):
+                self._cut(int(env))
         return StepRecord(
             rows=rows,
             positions=positions,
@@ -308,6 +161,7 @@ class TrajectoryReplayBuffer(ReplayBuffer):
             started=started,
             start_positions=self._start_positions(obs, started),
             finished=finished,
+            parts=self._parts,
         )
 
     def _start_positions(self, obs: Observation, envs: np.ndarray) -> np.ndarray:
@@ -323,43 +177,67 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         check_finite("mode features", positions)
         return positions
 
-    def _write_rows(
-        self, rows: np.ndarray, obs: Any, next_obs: Any, action: np.ndarray, reward: np.ndarray, done: np.ndarray
-    ) -> None:
-        self._write_observations(self.steps, "observations", rows, obs)
-        self._write_observations(self.nexts, "next_observations", rows, next_obs)
-        self.steps.write("actions", rows, action)
-        self.rewards[rows] = reward
-        self.dones[rows] = done
-        self.timeouts[rows] = False
-        self.next_row[rows] = -1
-
-    @staticmethod
-    def _write_observations(part: Any, name: str, rows: np.ndarray, value: Any) -> None:
-        values = {f"{name}/{key}": each for key, each in value.items()} if isinstance(value, dict) else {name: value}
-        for field, each in values.items():
-            part.write(field, rows, np.asarray(each).reshape(len(rows), *part[field].shape[1:]))
-
     def _finish(self, env: int, info: dict[str, Any]) -> Trajectory:
-        rows, episode_return = self.running.end(env)
-        trajectory = Trajectory(
-            rows=rows,
-            success=self.success_rule(info, episode_return),
-            episode_return=episode_return,
-            serial=self.n_finished,
-            label=None if info.get("mode") is None else str(info["mode"]),
-        )
-        self.n_finished += 1
-        self._insert(trajectory)
+        """Store an episode that is over."""
+        self.success_rule.check_key(info)
+        trajectory = self._store(env, info)
+        self.success_rule.end(env)
         return trajectory
+
+    def _cut(self, env: int) -> None:
+        """Store what an episode has done so far. It goes on: for the part's last step, as if it met a time limit."""
+        if not self._warned_parts:
+            self._warned_parts = True
+            warnings.warn(
+                f"An episode goes on after {self.running.lengths[env]} steps. Environments without a time limit are stored in "
+                f"parts, of at most {self._longest_part()} steps with this buffer_size={self.buffer_size}, as if a time limit "
+                "ended each: a goal must be reached within one. gymnasium.wrappers.TimeLimit gives them one"
+            )
+        self._parts.append((env, self._store(env, {})))
+
+    def _store(self, env: int, info: dict[str, Any]) -> Trajectory:
+        """Make a trajectory of a running episode up to its goal, and another one of what it did after that."""
+        told = self.success_rule.so_far(env, info)
+        before = int(self.success_rule.steps[env])  # in parts that are stored already
+        rows, episode_return = self.running.end(env)
+        before -= len(rows)
+        reached = bool(told.success) and told.length > before
+        to_goal = told.length - before if reached else 0 if told.success else len(rows)
+        whole = self._stored(rows[:to_goal], episode_return, told.label) if to_goal else None
+        if whole is not None:
+            whole.success = reached or self.success_rule.among_best(episode_return)
+            self._insert(whole)
+        past = rows[to_goal:]
+        if not len(past):
+            return whole  # type: ignore[return-value]
+        if whole is not None:
+            # Windows end at the goal: what follows may leave the buffer before it
+            self.next_row[whole.rows[-1]] = -1
+        rest = self._stored(past, float(self.rewards[past].sum(dtype=np.float64)), None)
+        rest.mode = PAST_GOAL
+        self._insert(rest)
+        return rest if whole is None else whole
+
+    def _stored(self, rows: np.ndarray, episode_return: float, label: str | None) -> Trajectory:
+        self.n_finished += 1
+        return Trajectory(rows, success=False, episode_return=episode_return, serial=self.n_finished - 1, label=label)
 
     def _insert(self, trajectory: Trajectory) -> None:
         self.groups.insert(trajectory)
 
+    def _take_back_successes(self) -> None:
+        """
+        Judge again what is stored. Until an environment said for the first time what a success is, the best returns stood in
+        for successes; of those episodes none has reached a goal, or it would have been said.
+        """
+        self.groups.take_back_successes()
+
     def drop_unfinished_episodes(self) -> None:
         """Forget the transitions of running episodes: call it when the environments were reset outside."""
-        for env in np.flatnonzero(self.running.lengths > 0):
-            self._free_rows(self.running.end(int(env))[0])
+        for env in range(self.n_envs):
+            self.success_rule.end(env)
+            if self.running.lengths[env]:
+                self._release(self.running.end(env)[0])
 
     @property
     def has_success_signal(self) -> bool:
@@ -372,77 +250,3 @@ class TrajectoryReplayBuffer(ReplayBuffer):
         :return: Those in use by a mode or not yet clustered, in order of finishing
         """
         return self.groups.of(success)
-
-    # ------------------------------------------------------------------ positions
-
-    def positions(self, part: Any, name: str, rows: np.ndarray) -> np.ndarray:
-        """
-        :param part: ``steps`` or ``nexts``
-        :param name: ``"observations"`` or ``"next_observations"``
-        :param rows: Shape [N]
-        :return: Mode features there, shape [N, dim]
-        """
-        return self.features.of_tensors(self._as_observation(part.tensors(rows), name)).cpu().numpy()
-
-    # ------------------------------------------------------------------ reading
-
-    def read_observations(self, rows: np.ndarray) -> tuple[Any, Any]:
-        """
-        :param rows: Shape [N]
-        :return: Observations and next observations of the rows, not normalised: tensors [N, ...] or dicts of such
-        """
-        return (
-            self._as_observation(self._on_device(self.steps.tensors(rows)), "observations"),
-            self._as_observation(self._on_device(self.nexts.tensors(rows)), "next_observations"),
-        )
-
-    def _on_device(self, fields: dict[str, th.Tensor]) -> dict[str, th.Tensor]:
-        # Back to the main memory a copy must be waited for
-        wait = self.device.type == "cpu"
-        return {name: value.to(self.device, non_blocking=not wait) for name, value in fields.items()}
-
-    def _to_device(self, array: np.ndarray) -> th.Tensor:
-        """The same values on the device of the samples; not waited for."""
-        return th.from_numpy(array).to(self.device, non_blocking=True)
-
-    def normalized(self, obs: Any, env: VecNormalize | None) -> Any:
-        """
-        :param obs: Tensors of observations, or a dict of such
-        :param env: Normalises them, in the main memory, when given
-        :return: What the networks see of them
-        """
-        if env is None:
-            return obs
-        host = {key: each.cpu().numpy() for key, each in obs.items()} if isinstance(obs, dict) else obs.cpu().numpy()
-        normalized: Any = self._normalize_obs(host, env)
-        if isinstance(normalized, dict):
-            return {key: self.to_torch(value) for key, value in normalized.items()}
-        return self.to_torch(normalized)
-
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """
-        Draw transitions uniformly, whatever their mode.
-
-        :param batch_size: Number of transitions
-        :param env: Normalises observations and rewards when given
-        :return: SB3's samples
-        """
-        return self.read(self.stored_rows.sample(batch_size), env)
-
-    def read(self, rows: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """
-        :param rows: Shape [N]
-        :param env: Normalises observations and rewards when given
-        :return: Their transitions, as SB3's samples
-        """
-        steps = self._on_device(self.steps.tensors(rows))
-        nexts = self._on_device(self.nexts.tensors(rows))
-        dones = (self.dones[rows] & ~self.timeouts[rows]).astype(np.float32)
-        samples = DictReplayBufferSamples if isinstance(self.observation_space, spaces.Dict) else ReplayBufferSamples
-        return samples(  # type: ignore[return-value]
-            observations=self.normalized(self._as_observation(steps, "observations"), env),
-            actions=steps["actions"],
-            next_observations=self.normalized(self._as_observation(nexts, "next_observations"), env),
-            dones=self.to_torch(dones[:, None]),
-            rewards=self.to_torch(self._normalize_reward(self.rewards[rows, None], env)),
-        )

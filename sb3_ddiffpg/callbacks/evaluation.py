@@ -10,19 +10,23 @@ import gymnasium as gym
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_ddiffpg.buffers.success import read_success
+from sb3_ddiffpg.buffers.success import GoalWatch, Outcome
 from sb3_ddiffpg.callbacks.periodic import _PeriodicCallback
+from sb3_ddiffpg.evaluation.environments import vectorized
 from sb3_ddiffpg.evaluation.evaluate import evaluate_modes
 from sb3_ddiffpg.evaluation.results import ModeEvaluation
+from sb3_ddiffpg.evaluation.rollout import knows_success
 from sb3_ddiffpg.serialization.safetensors_tree import convert
 from sb3_ddiffpg.utils.disk import missed_if_full
 from sb3_ddiffpg.utils.rng import preserved_rng
+from sb3_ddiffpg.utils.vec_envs import labels_routes
 
 
 class ModeEvalCallback(EvalCallback):
     """
     SB3's ``EvalCallback``, which also logs ``eval/n_modes``: the number of different ground-truth labels (``info["mode"]``)
-    among the episodes that reached the goal. It is as lucky as their number is small; start the episodes from one place.
+    among the episodes that reached the goal, at their last step or before. It is as lucky as their number is small; start the
+    episodes from one place.
 
     :param eval_env: The environment used for evaluation
     :param kwargs: Further arguments of ``EvalCallback``; ``deterministic`` is False unless given
@@ -30,18 +34,31 @@ class ModeEvalCallback(EvalCallback):
 
     def __init__(self, eval_env: gym.Env | VecEnv, **kwargs: Any) -> None:
         super().__init__(eval_env, **{"deterministic": False, **kwargs})
-        self._labels: set[Any] = set()
+        self._labels: set[str] = set()
+        self._labelled = labels_routes(self.eval_env)
+        self._watch = GoalWatch(self.eval_env.num_envs)
+        self._outcomes: list[Outcome] = []
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
-        super()._log_success_callback(locals_, globals_)
-        info = locals_["info"]
-        if locals_["done"] and "mode" in info:
-            if read_success(info, getattr(self.model, "success_key", None)) and info["mode"] is not None:
-                self._labels.add(info["mode"])
+        # Not SB3's, which knows only the last step and only info["is_success"]
+        env, info = locals_["i"], locals_["info"]
+        self._watch.observe_one(env, info)
+        if not locals_["done"]:
+            return
+        outcome = self._watch.so_far(env, info)
+        self._watch.end(env)
+        self._outcomes.append(outcome)
+        if self._watch.has_signal:  # perhaps only now: those before have failed
+            self._is_success_buffer = [bool(each.success) for each in self._outcomes]
+        if outcome.label is not None and outcome.success:
+            self._labels.add(outcome.label)
+        if self._labelled:
             self.logger.record("eval/n_modes", len(self._labels))
 
     def _on_step(self) -> bool:
-        self._labels = set()
+        self._labels, self._outcomes = set(), []
+        self._watch = GoalWatch(self.eval_env.num_envs, getattr(self.model, "success_key", None), self._labelled)
+        self._watch.has_signal = knows_success(self.model)
         goes_on = True
         with preserved_rng(), missed_if_full("What the evaluation found"):
             goes_on = super()._on_step()
@@ -62,7 +79,7 @@ class EvaluateModesCallback(_PeriodicCallback):
     Runs :func:`~sb3_ddiffpg.evaluation.evaluate_modes` during training and logs what follows from it under ``eval_modes/``.
     Give it environments with one fixed start.
 
-    :param eval_env: Environments used for evaluation
+    :param eval_env: Environments used for evaluation, or a single one
     :param eval_freq: Environment steps between two evaluations
     :param n_episodes: Episodes for each command, and twice as many without
     :param path: Of a file to which each evaluation is appended, one line of JSON each
@@ -73,7 +90,7 @@ class EvaluateModesCallback(_PeriodicCallback):
 
     def __init__(
         self,
-        eval_env: VecEnv,
+        eval_env: gym.Env | VecEnv,
         eval_freq: int = 10_000,
         n_episodes: int = 20,
         path: str | Path | None = None,
@@ -81,7 +98,7 @@ class EvaluateModesCallback(_PeriodicCallback):
         **kwargs: Any,
     ) -> None:
         super().__init__("eval_freq", eval_freq)
-        self.eval_env, self.n_episodes, self.kwargs = eval_env, n_episodes, kwargs
+        self.eval_env, self.n_episodes, self.kwargs = vectorized(eval_env), n_episodes, kwargs
         self.path = None if path is None else Path(path)
         self.best_model_path = None if best_model_path is None else Path(best_model_path)
         if self.best_model_path is not None and self.best_model_path.suffix != ".zip":

@@ -17,18 +17,22 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
 from sb3_ddiffpg.buffers.batch import ModeBatch, VisitedSteps
-from sb3_ddiffpg.buffers.features import declared_cell_size, declared_mode_features, describe_env
+from sb3_ddiffpg.buffers.features import declared_cell_size
 from sb3_ddiffpg.buffers.mode_buffer import ModeReplayBuffer
-from sb3_ddiffpg.common.checks import check_each, check_model
+from sb3_ddiffpg.common.checks import check_each, check_model, take_number_of_critics
 from sb3_ddiffpg.common.collection import CollectingAlgorithm
 from sb3_ddiffpg.common.presets import preset
+from sb3_ddiffpg.common.scales import features_of, review_scales
+from sb3_ddiffpg.envs.description import describe_env
 from sb3_ddiffpg.envs.snapshots import SoundNormalization
-from sb3_ddiffpg.exploration.bonus import ExplorationBonus, make_bonus
+from sb3_ddiffpg.exploration.bonus import ExplorationBonus
+from sb3_ddiffpg.exploration.bonus_factory import make_bonus
 from sb3_ddiffpg.exploration.noise import noise_for
 from sb3_ddiffpg.exploration.settings import NoveltySettings
 from sb3_ddiffpg.networks.cuda_graphs import graphed
 from sb3_ddiffpg.networks.policies import TwinCriticPolicy, average_networks
 from sb3_ddiffpg.networks.settings import CriticSettings
+from sb3_ddiffpg.networks.value_range import ValueRange
 from sb3_ddiffpg.saving._legacy import parts_of_0_1
 from sb3_ddiffpg.saving.model import built
 from sb3_ddiffpg.saving.records import saved_part
@@ -71,7 +75,7 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
     :param novelty: What is new and what it is worth, see ``NoveltySettings``
     :param stats_window_size: Window size for the rollout logging
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
-    :param policy_kwargs: Additional arguments of the policy
+    :param policy_kwargs: Additional arguments of the policy, SB3's ``n_critics`` among them
     :param verbose: 0: no output, 1: info messages, 2: debug messages
     :param seed: Seed for the pseudo random generators
     :param device: Device on which the code should run; "auto" uses the GPU if possible
@@ -96,7 +100,7 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
     bonus: ExplorationBonus
     _parts: ClassVar[dict[str, str]] = {"bonus": "bonus"}
     _unsaved: ClassVar[dict[str, None]] = dict.fromkeys(
-        ("actor", "critics", "bonus", "visits", "graphs", "divergence_watch", "sound_normalization")
+        ("actor", "critics", "bonus", "graphs", "divergence_watch", "sound_normalization", "value_range")
     )
     _only_to_train: ClassVar[dict[str, None]] = dict.fromkeys(
         ("bonus.novelty_model", "bonus.moments", "bonus.novelty_model.optimizer")
@@ -120,7 +124,7 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
         replay_buffer_class: type[ModeReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
-        n_steps: int = 1,
+        n_steps: int | None = 1,
         qf_learning_rate: float | Schedule | None = None,
         reward_scale: float = 1.0,
         max_grad_norm: float = 1.0,
@@ -164,7 +168,7 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
             support_multi_env=True,
         )
         # Not handed on: SB3 would make a buffer of its own for it
-        self.n_steps = n_steps
+        self.n_steps = n_steps  # type: ignore[assignment]
         self.qf_learning_rate = qf_learning_rate
         self.reward_scale = reward_scale
         self.max_grad_norm = max_grad_norm
@@ -178,6 +182,11 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
         #: What the environment declared when the model was made; the counts are in these cells
         self.novelty_cell_size: float | None = None
         self._warned_support = self._warned_cut_values = False
+        # When scales are measured again; whether mode features were chosen from what was seen, and from episodes that reached
+        # the goal, see ``common.scales``
+        self.next_review, self.features_found, self.features_settled = 0, False, False
+        #: The unit of the values that the critics learn
+        self.value_range = ValueRange(adapts=False)
 
         if _init_setup_model:
             self._setup_model()
@@ -201,7 +210,7 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
     def _policy_arguments(self) -> dict[str, Any]:
         """What the algorithm's own arguments say about the policy."""
         critic = self.critic_settings
-        support = (critic.v_min, critic.v_max)
+        support = critic.support
         return {
             "n_critics": critic.n_critics,
             "n_atoms": critic.n_atoms,
@@ -212,13 +221,20 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
 
     def _buffer_arguments(self) -> dict[str, Any]:
         """What they say about the replay buffer."""
-        return {"mode_features": self.resolved_features, "success_key": self.success_key}
+        given, chosen = self.mode_features is not None, self.features_found
+        return {
+            "mode_features": self.resolved_features,
+            "success_key": self.success_key,
+            # What an environment declares, and a part of an observation, has one unit
+            "standardize": self.resolved_features is None or chosen or (given and not isinstance(self.mode_features, str)),
+        }
 
     def _setup_model(self) -> None:
         if (parts := parts_of_0_1(vars(self))) is not None:
             self.saved_parts = parts
         absorb_settings(self)
         check_each(self)
+        take_number_of_critics(self)
         self._setup_parts()
         check_model(self, self._policy_arguments())
         for name in ("learning_rate", "qf_learning_rate"):
@@ -226,7 +242,7 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
                 setattr(self, name, float(rate))  # SB3 wants Python's
         if self.replay_buffer_class is None:
             self.replay_buffer_class = self.default_replay_buffer_class
-        self._resolve_mode_features()
+        self.resolved_features = features_of(self)
         if self.novelty_cell_size is None and self.mode_features is None:
             self.novelty_cell_size = declared_cell_size(self.env, "novelty_cell_size")
         given = self.policy_class, self.policy_kwargs, self.replay_buffer_kwargs, self.n_steps
@@ -247,7 +263,7 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
             (self.replay_buffer.features.dim, self.policy.actor.features_dim),
             self.n_envs,
             counted_cell=self.novelty_cell_size,
-            seen_cell=declared_cell_size(self.env),
+            seen_cell=declared_cell_size(self.env) if self.mode_features is None else None,
         ).to(self.device)
         if self.env is not None:
             self.env_spec = describe_env(self.env)
@@ -256,16 +272,10 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
         self._create_aliases()
         if (saved := saved_part(self, "bonus")) is not None:
             self.bonus.load_state_dict(saved)
-        self.visits, self.saved_parts = self.bonus.visit_map, None
+        self.saved_parts = None
 
     def _setup_parts(self) -> None:
         """Make what networks and buffer depend on."""
-
-    def _resolve_mode_features(self) -> None:
-        if self.mode_features is not None:
-            self.resolved_features = self.mode_features
-        elif self.env is not None:
-            self.resolved_features = declared_mode_features(self.env)
 
     def _create_aliases(self) -> None:
         self.actor, self.critics = self.policy.actor, self.policy.critics
@@ -297,6 +307,7 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
         :param gradient_steps: How many there will be
         :return: Where to note their numbers, of which the means are logged
         """
+        review_scales(self)
         metrics: Metrics = defaultdict(list)
         self.policy.set_training_mode(True)
         progress = self._current_progress_remaining
@@ -314,11 +325,14 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
         means = {name: th.stack(values).mean().item() for name, values in metrics.items()}
         for name, mean in means.items():
             self.logger.record(f"train/{name}", mean)
-        if means.get(CUT_VALUES, 0.0) > MOST_CUT_VALUES and not self._warned_cut_values:
+        cut, values = means.get(CUT_VALUES, 0.0), self.value_range
+        values.observe_targets(cut, gradient_steps)
+        if cut > MOST_CUT_VALUES and not values.grows and not self._warned_cut_values:
             self._warned_cut_values = True
             (critics, limit, scales), value = self._first_group, self.policy.critics.upper[0].item()
+            value *= values.novelty_unit if values.adapts else 1.0
             warnings.warn(
-                f"{means[CUT_VALUES]:.0%} of the {critics}' targets are cut off at {limit}={value:g}, "
+                f"{cut:.0%} of the {critics}' targets are cut off at {limit}={value:g}, "
                 f"where one place is as good as another and exploration stops: raise {limit} or lower {scales}"
             )
 
@@ -354,7 +368,7 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
         self, batch: ModeBatch, rewards: th.Tensor, metrics: Metrics, names: Sequence[str] = ("critics",)
     ) -> None:
         """One step of the critics of all groups, which errors call by these names."""
-        losses, norms, at_top = self.graphs["critics"](batch, rewards)
+        losses, norms, at_top = self.graphs["critics"](batch, self.value_range.scaled(rewards, batch.discounts))
         others = ["critics' features extractor"] if len(norms) > len(losses) else []
         with self.critics.at_rest(batch.dormant):
             self.divergence_watch.step(names, self.critics.optimizer, losses, norms, others=others)
@@ -414,4 +428,5 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
         :return: Shape [N]
         """
         self.policy.set_training_mode(False)
-        return self.policy.state_values(self.policy.obs_to_tensor(observation)[0], n_actions).cpu().numpy()
+        values = self.policy.state_values(self.policy.obs_to_tensor(observation)[0], n_actions).cpu().numpy()
+        return self.value_range.values(values)

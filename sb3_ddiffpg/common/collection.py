@@ -12,14 +12,17 @@ from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn
 
 from sb3_ddiffpg.buffers.mode_buffer import ModeReplayBuffer
 from sb3_ddiffpg.buffers.returns import discounted_returns
-from sb3_ddiffpg.buffers.trajectory import StepRecord, Trajectory
+from sb3_ddiffpg.buffers.trajectory import StepRecord
+from sb3_ddiffpg.common.scales import review_scales
 from sb3_ddiffpg.envs.snapshots import SoundNormalization
 from sb3_ddiffpg.exploration.bonus import ExplorationBonus
 from sb3_ddiffpg.exploration.visit_map import VisitMap
 from sb3_ddiffpg.networks.cuda_graphs import GraphedFunction
 from sb3_ddiffpg.networks.settings import CriticSettings
+from sb3_ddiffpg.networks.value_range import ValueRange
 from sb3_ddiffpg.saving.algorithm import SavableAlgorithm
 from sb3_ddiffpg.utils.divergence import check_finite
+from sb3_ddiffpg.utils.settings import at_least
 
 SelfCollecting = TypeVar("SelfCollecting", bound="CollectingAlgorithm")
 
@@ -51,31 +54,44 @@ class CollectingAlgorithm(SavableAlgorithm):
 
     replay_buffer: ModeReplayBuffer
     bonus: ExplorationBonus
-    #: Where the run has been; None where there are more than three mode features
-    visits: VisitMap | None
     critic_settings: CriticSettings
     reward_scale: float
     graphs: dict[str, Callable[..., Any]]
     sound_normalization: SoundNormalization
+    value_range: ValueRange
+    next_review: int
     _warned_support: bool
+
+    @property
+    def visits(self) -> VisitMap | None:
+        """Where the run has been; None where there are more than three mode features, and before learning has begun."""
+        return self.bonus.visit_map
 
     def learn(
         self: SelfCollecting,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 100,
-        tb_log_name: str = "run",
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
+        horizon: int | None = None,
     ) -> SelfCollecting:
         """
-        Train the model. See SB3's ``learn``; ``log_interval`` counts episodes of all environments. The first call after
-        ``resume`` is given what the interrupted one was given, and does what was left of it.
+        Train the model. See SB3's ``learn``; ``log_interval`` counts episodes of all environments, and TensorBoard's logs are
+        called as the algorithm when no name is given. The first call after ``resume`` is given what the interrupted one was
+        given, and does what was left of it.
+
+        :param horizon: Steps of the whole run, of which this call is a piece: schedules follow the run then. It is remembered
         """
+        if horizon is not None:
+            at_least(1).check("horizon", horizon)
+            self.horizon = int(horizon)
         # Denormal numbers in Adam's moments slow a small update down by half
         th.set_flush_denormal(True)
         try:
-            return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+            name = tb_log_name or type(self).__name__
+            return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
         finally:
             th.set_flush_denormal(False)
 
@@ -91,10 +107,9 @@ class CollectingAlgorithm(SavableAlgorithm):
         self.replay_buffer.claim(self.env)
         self.sound_normalization.note(self._vec_normalize_env)  # the environments may be reset now
         if self._vec_normalize_env is not None and self._vec_normalize_env.norm_reward:
-            low, high = self.critic_settings.v_min, self.critic_settings.v_max
             warnings.warn(
-                "VecNormalize scales the rewards (norm_reward=True), and so the values, which the critics' support "
-                f"[v_min={low}, v_max={high}] must cover; norm_reward=False leaves them in reward units"
+                "VecNormalize scales the rewards (norm_reward=True), and so the values, differently in the course of the run; "
+                "norm_reward=False leaves them in reward units, and DDiffPG's critics follow these"
             )
         for graph in self.graphs.values():
             if isinstance(graph, GraphedFunction):
@@ -152,6 +167,8 @@ class CollectingAlgorithm(SavableAlgorithm):
         if self.num_timesteps < learning_starts:
             scaled_action = np.random.uniform(-1.0, 1.0, size=shape).astype(np.float32)
         else:
+            if not self.next_review and self.replay_buffer.size():  # before anything acts on raw numbers
+                review_scales(self)
             scaled_action = self.policy.scale_action(self._training_actions())
             if action_noise is not None:
                 scaled_action = np.clip(scaled_action + action_noise().reshape(shape), -1.0, 1.0)
@@ -170,21 +187,28 @@ class CollectingAlgorithm(SavableAlgorithm):
         super()._store_transition(recorder, *args, **kwargs)
         # From environments to the record, from the record to the bonus
         self.bonus.observe(recorder.record, replay_buffer)
-        self._on_episodes_end(recorder.record.finished)
+        self._on_episodes_end(recorder.record)
 
-    def _on_episodes_end(self, finished: list[tuple[int, Trajectory]]) -> None:
+    def _on_episodes_end(self, record: StepRecord) -> None:
         """
-        :param finished: Environments whose episodes have ended, perhaps none, and these
+        :param record: Of a step, with the episodes that it has ended, perhaps none, and parts of those that go on
         """
-        low, high = self.critic_settings.v_min, self.critic_settings.v_max
-        for _, trajectory in finished:
-            if self._warned_support:
+        for _, trajectory in (*record.parts, *record.finished):
+            if self._warned_support and not self.value_range.adapts:
                 return
-            # Once: values that the critics cannot represent make all actions look alike
-            rewards = self.reward_scale * self.replay_buffer.rewards[trajectory.rows]
-            returns = discounted_returns(rewards, self.gamma)
+            buffer, last = self.replay_buffer, trajectory.rows[-1]
+            rewards = self.reward_scale * buffer.training_rewards(trajectory.rows, self._vec_normalize_env)
+            goes_on = bool(buffer.timeouts[last] or not buffer.dones[last])
+            at_goal = bool(buffer.goals[last]) and buffer.has_success_signal
+            then = "ends" if not goes_on else "stays" if at_goal else "goes on"
+            returns = discounted_returns(rewards, self.gamma, then)
+            if self.value_range.adapts:
+                self.value_range.observe(returns)
+                continue
+            low, high = self.critic_settings.support
             if returns.max() > high + 1e-6 or returns.min() < low - 1e-6:
                 self._warned_support = True
+                # Once: values that the critics cannot represent make all actions look alike
                 warnings.warn(
                     f"A discounted return between {returns.min():.4g} and {returns.max():.4g} leaves the critics' support "
                     f"[v_min={low}, v_max={high}] and is clipped: adapt critic.v_min, critic.v_max or reward_scale"

@@ -16,13 +16,14 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from sb3_ddiffpg.buffers.batch import ModeBatch
 from sb3_ddiffpg.buffers.features import same_selection
 from sb3_ddiffpg.buffers.mode_buffer import ModeReplayBuffer
-from sb3_ddiffpg.buffers.trajectory import NO_MODE, Trajectory
+from sb3_ddiffpg.buffers.trajectory import NO_MODE, StepRecord
 from sb3_ddiffpg.callbacks.clustering import ClusteringCallback, contains_clustering
 from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm, Metrics
-from sb3_ddiffpg.ddiffpg.policies import DiffusionPolicy
+from sb3_ddiffpg.common.scales import settle_features
+from sb3_ddiffpg.ddiffpg.policies import CnnDiffusionPolicy, DiffusionPolicy
 from sb3_ddiffpg.exploration.episode_scheduler import EpisodeScheduler
 from sb3_ddiffpg.exploration.settings import ExplorationSettings, NoveltySettings
-from sb3_ddiffpg.modes.history import ModeEvent, ModeHistory
+from sb3_ddiffpg.modes.history import BIRTHS, ModeEvent, ModeHistory
 from sb3_ddiffpg.modes.manager import ModeManager
 from sb3_ddiffpg.modes.mode import Mode, ModeTable
 from sb3_ddiffpg.modes.settings import ModeSettings
@@ -31,6 +32,7 @@ from sb3_ddiffpg.networks.cuda_graphs import graphed
 from sb3_ddiffpg.networks.diffusion import DiffusionActor
 from sb3_ddiffpg.networks.settings import CriticSettings, TargetActionSettings
 from sb3_ddiffpg.networks.target_actions import climb
+from sb3_ddiffpg.networks.value_range import ValueRange
 from sb3_ddiffpg.saving.algorithm import read_parameters
 from sb3_ddiffpg.saving.records import saved_part
 from sb3_ddiffpg.serialization.safetensors_tree import Count
@@ -49,7 +51,8 @@ class DDiffPG(ActorCriticAlgorithm):
     ``docs/ddiffpg.md``. The defaults suit a laptop; the paper's own numbers are in ``zoo_hyperparams/ddiffpg.yml``, from which
     ``from_preset`` takes them.
 
-    :param policy: ``"DiffusionPolicy"``, ``"MlpPolicy"`` (the same), ``"MultiInputPolicy"`` (dict observations) or a class
+    :param policy: ``"DiffusionPolicy"``, ``"MlpPolicy"`` (the same), ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict
+        observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param learning_rate: Learning rate of the diffusion policy, a float or a function of the remaining progress (from 1 to 0)
     :param buffer_size: Capacity of the replay buffer in transitions, over all environments
@@ -64,7 +67,8 @@ class DDiffPG(ActorCriticAlgorithm):
     :param replay_buffer_class: ``ModeReplayBuffer`` or a subclass of it
     :param replay_buffer_kwargs: Further keyword arguments of the replay buffer
     :param optimize_memory_usage: Not supported
-    :param n_steps: Not supported: see ``modes`` and ``exploration``
+    :param n_steps: Length of the multi-step returns (uncorrected), where ``modes`` and ``exploration`` do not say theirs;
+        None: 5 for the modes' critics, 1 for the exploratory ones
     :param qf_learning_rate: Learning rate of the critics, like ``learning_rate``; the same as it when None
     :param n_diffusion_steps: Number of diffusion steps T
     :param recluster_freq: Rollouts between two re-clusterings
@@ -95,11 +99,15 @@ class DDiffPG(ActorCriticAlgorithm):
         "DiffusionPolicy": DiffusionPolicy,
         "MlpPolicy": DiffusionPolicy,
         "MultiInputPolicy": DiffusionPolicy,
+        "CnnPolicy": CnnDiffusionPolicy,
     }
     settings_groups: ClassVar[tuple[type[Settings], ...]] = (
         *(CriticSettings, NoveltySettings, ExplorationSettings, ModeSettings, TargetActionSettings),
     )
-    accepted: ClassVar[dict[str, Accepted]] = {"n_diffusion_steps": at_least(1), "recluster_freq": at_least(1)}
+    accepted: ClassVar[dict[str, Accepted]] = {
+        **dict.fromkeys(("n_diffusion_steps", "recluster_freq"), at_least(1)),
+        "n_steps": at_least(1).or_none(),
+    }
     manager_class: ClassVar[type[ModeManager]] = ModeManager
     policy: DiffusionPolicy
     actor: DiffusionActor
@@ -111,7 +119,7 @@ class DDiffPG(ActorCriticAlgorithm):
     scheduler: EpisodeScheduler
     _first_group = ("exploratory critics", "exploration.v_max", "novelty.coef")
     _counters: ClassVar[dict[str, Any]] = {"n_rollouts": Count}
-    _parts: ClassVar[dict[str, str]] = {"modes": "mode_manager"}
+    _parts: ClassVar[dict[str, str]] = {"modes": "mode_manager", "values": "value_range"}
     episode_part = "scheduler"
     _unsaved: ClassVar[dict[str, None]] = dict.fromkeys(("mode_manager", "scheduler", "mode_history"))
     _only_to_train: ClassVar[dict[str, None]] = {"bonus.known_cells": None}
@@ -132,7 +140,7 @@ class DDiffPG(ActorCriticAlgorithm):
         replay_buffer_class: type[ModeReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
-        n_steps: int = 1,
+        n_steps: int | None = None,
         qf_learning_rate: float | Schedule | None = None,
         n_diffusion_steps: int = 5,
         recluster_freq: int = 25,
@@ -198,8 +206,6 @@ class DDiffPG(ActorCriticAlgorithm):
     # ------------------------------------------------------------------ set-up
 
     def _setup_parts(self) -> None:
-        if self.n_steps != 1:
-            raise ValueError(f"n_steps={self.n_steps} is not supported: use modes.n_steps and exploration.n_steps instead")
         n_groups = self.mode_settings.max_modes + 1
         if self.batch_size < n_groups:
             raise ValueError(
@@ -213,24 +219,33 @@ class DDiffPG(ActorCriticAlgorithm):
         if (saved := saved_part(self, "episodes")) is not None:
             with contextlib.suppress(ValueError):  # of another number of environments: new episodes begin
                 self.scheduler.load_state_dict(saved, self.n_envs)
+        novelty_range = self.exploration_settings.novelty_range(self.novelty_settings, self.gamma)
+        self.value_range = ValueRange(self.critic_settings.adapts, *novelty_range)
+        if (saved := saved_part(self, "values")) is not None:
+            self.value_range.load_state_dict(saved)
         #: What became of the modes in the course of the run
         self.mode_history: ModeHistory = self.mode_manager.history
 
     def _policy_arguments(self) -> dict[str, Any]:
+        critic = self.critic_settings
+        most = self.exploration_settings.v_max_beside(self.novelty_settings, critic.support[1], self.gamma)
         return {
             **super()._policy_arguments(),
             "n_modes": len(self.mode_manager),
             "n_diffusion_steps": self.n_diffusion_steps,
             "mode_embedding_dim": self.mode_settings.embedding_dim,
-            "exploration_support": (
-                0.0,
-                self.exploration_settings.v_max_beside(self.novelty_settings, self.critic_settings.v_max, self.gamma),
-            ),
+            "support": (0.0, 1.0) if critic.adapts else critic.support,
+            "exploration_support": (0.0, 1.0) if critic.adapts else (0.0, most),
         }
 
     def _buffer_arguments(self) -> dict[str, Any]:
+        arguments, given = super()._buffer_arguments(), self.mode_features is not None
+        # Distances that are given are in the unit of the features
+        measured = self.mode_settings.distance_threshold is not None or "compared_length" in self.replay_buffer_kwargs
+        standardize = arguments["standardize"] and not (given and measured)
         return {
-            **super()._buffer_arguments(),
+            **arguments,
+            "standardize": standardize,
             "max_successes_per_mode": self.mode_settings.max_successes,
             "max_failures_per_mode": self.mode_settings.max_failures,
             "explore_beyond_goals": self.exploration_settings.beyond_goals,
@@ -241,11 +256,16 @@ class DDiffPG(ActorCriticAlgorithm):
         super()._setup_model()
         found_in = self.mode_manager.mode_features
         if len(self.mode_manager) and not same_selection(found_in, self.resolved_features):
-            raise ValueError(f"mode_features={self.resolved_features}: the modes of this model were found in {found_in}")
+            raise ValueError(
+                f"mode_features={self.resolved_features}: the modes of this model were found in {found_in}. Load it so, "
+                "and then change them by use_features"
+            )
         dim = self.replay_buffer.features.dim
         if any(mode.representative.shape[1] not in (0, dim) for mode in self.mode_manager.modes):  # of a file
             raise ValueError(f"modes.representative: accepted are positions of {dim} components")
         self.replay_buffer.expect_modes(len(self.mode_manager))
+        if self.mode_manager.success_is_told:  # so the best returns are no longer a stand-in, in a new buffer either
+            self.replay_buffer.success_rule.has_signal = True
 
     def _create_aliases(self) -> None:
         super()._create_aliases()
@@ -268,8 +288,8 @@ class DDiffPG(ActorCriticAlgorithm):
                 batch = self.replay_buffer.sample_modes(
                     batch_size,
                     self.gamma,
-                    self.exploration_settings.n_steps,
-                    self.mode_settings.n_steps,
+                    self.exploration_settings.n_steps_beside(self.n_steps),
+                    self.mode_settings.n_steps_beside(self.n_steps),
                     env=self._vec_normalize_env,
                     exploration_gamma=self.exploration_settings.gamma,
                     visits_of_modes=self.mode_settings.novelty_coef != 0.0,
@@ -291,8 +311,10 @@ class DDiffPG(ActorCriticAlgorithm):
         intrinsic = self._intrinsic_rewards(batch.visited, metrics, self.exploration_settings.gamma)
         rewards = self.reward_scale * batch.rewards
         if self.mode_settings.novelty_coef != 0.0:
-            rewards = rewards + self.mode_settings.novelty_coef * intrinsic
-        of_new_routes = self.exploration_settings.new_route_coef * self.reward_scale * batch.new_routes
+            rewards = rewards + self.mode_settings.novelty_coef * self.value_range.unit * intrinsic
+        # What a goal is worth beside novelty must not depend on the unit of the reward
+        worth = self.exploration_settings.new_route_coef * self.reward_scale / self.value_range.unit
+        of_new_routes = worth * batch.new_routes
         rewards[EXPLORATORY_GROUP] = intrinsic[EXPLORATORY_GROUP] + of_new_routes
         return rewards
 
@@ -335,6 +357,7 @@ class DDiffPG(ActorCriticAlgorithm):
         :return: What happened: births, splits, merges and retirements
         """
         started, manager = time.perf_counter(), self.mode_manager
+        settle_features(self)
         with uninterrupted():
             events = manager.recluster(
                 self.replay_buffer, self.policy, self.scheduler, self.lifetime_steps, births=self._exploration_share() > 0
@@ -342,6 +365,8 @@ class DDiffPG(ActorCriticAlgorithm):
             if self.visits is not None:
                 self.visits.note(self.lifetime_steps)
             self.bonus.on_modes_changed(self.replay_buffer, manager.mastered())
+            born = any(event.kind in BIRTHS for event in events)
+            self.scheduler.note_news(self.lifetime_steps, self.bonus.n_cells, born)
         self.logger.record("modes/n_modes", len(manager))
         for mode in manager.modes:
             self.logger.record(f"modes/{mode.name}/n_trajectories", mode.n_trajectories)
@@ -399,6 +424,7 @@ class DDiffPG(ActorCriticAlgorithm):
         self.policy.set_training_mode(False)
         tensors, is_batch = self.policy.obs_to_tensor(observation)
         values = self.policy.group_values(tensors, n_actions)[1:].T.cpu().numpy()  # row 0 of the groups explores
+        values = self.value_range.values(values)
         return values if is_batch else values[0]
 
     def best_mode(self, observation: np.ndarray | dict[str, np.ndarray], n_actions: int = 8) -> Any:
@@ -457,16 +483,23 @@ class DDiffPG(ActorCriticAlgorithm):
     def _exploration_share(self) -> float:
         if self.num_timesteps < self.learning_starts:
             return 1.0  # random actions are no mode's doing
-        return self.scheduler.exploration_share(self._current_progress_remaining)
+        return self.scheduler.exploration_share(self._current_progress_remaining, self.lifetime_steps)
 
-    def _on_episodes_end(self, finished: list[tuple[int, Trajectory]]) -> None:
-        super()._on_episodes_end(finished)
-        for env, trajectory in finished:
-            assigned, commanded = self.scheduler.assigned_mode(env), self.scheduler.commanded_mode(env)
+    def _on_episodes_end(self, record: StepRecord) -> None:
+        super()._on_episodes_end(record)
+        for env, trajectory in (*record.parts, *record.finished):
+            assigned = self.scheduler.assigned_mode(env)
             trajectory.assigned_mode = None if assigned is None else self.mode_manager.numbers[assigned]
+        for env, trajectory in record.finished:
+            commanded = self.scheduler.commanded_mode(env)
             if commanded is not None:
                 self.mode_manager.note_outcome(commanded, trajectory)
             self.scheduler.begin(env, self._exploration_share())
+        for env, _ in record.parts:
+            if env not in dict(record.finished):
+                # Whoever drives the next part has not done so from the episode's beginning
+                self.scheduler.begin(env, self._exploration_share())
+                self.scheduler.handed_over[env] = True
 
     # ------------------------------------------------------------------ a run's beginning
 

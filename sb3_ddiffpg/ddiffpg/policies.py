@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
@@ -283,3 +283,9 @@ class DiffusionPolicy(TwinCriticPolicy):
         if self.n_modes:
             held[starts] = np.random.randint(0, self.n_modes, size=int(starts.sum()))
         return held
+
+
+class CnnDiffusionPolicy(DiffusionPolicy):
+    """``DiffusionPolicy`` for images, which go through SB3's ``NatureCNN``."""
+
+    default_features_extractor = NatureCNN

@@ -1,5 +1,8 @@
 """Environments with several routes to the goal. Importing this module registers them with gymnasium."""
 
+import contextlib
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -25,9 +28,12 @@ __all__ = [
     "Maze",
     "PointMazeEnv",
     "PointMazeVecEnv",
+    "import_packages",
     "is_ours",
     "make_vec_env",
     "reduce_word",
+    "registered_id",
+    "registered_spec",
 ]
 
 # Single environment -> the class that steps many of them together. Strings, so that simulators are imported when needed
@@ -51,56 +57,137 @@ for _name in ("Reach", "PegInHole", "DrawerClose", "CabinetOpen"):
 
 def is_ours(env_id: str) -> bool:
     """
-    :param env_id: id of a registered environment, perhaps with the module that registers it: ``"module:id"``
+    :param env_id: id of an environment, perhaps with the module that registers it, which is not imported: ``"module:id"``
     :return: whether it is a task of this package
     """
-    return str(_spec(env_id).entry_point).startswith("sb3_ddiffpg.")
+    spec = gym.registry.get(env_id.rpartition(":")[2])
+    return spec is not None and str(spec.entry_point).startswith("sb3_ddiffpg.")
 
 
-def _spec(env_id: str) -> EnvSpec:
+def registered_spec(env_id: str) -> EnvSpec:
+    """
+    What is registered by an id, also by gymnasium-robotics, which has to be imported for that.
+
+    :param env_id: id of a registered environment, perhaps with the module that registers it: ``"module:id"``
+    :return: what is registered
+    :raises ImportError: if there is no such module
+    :raises gymnasium.error.Error: if there is no such environment
+    """
     module, _, name = env_id.rpartition(":")
     if module:
         import_module(module)
+    elif name not in gym.registry:
+        with contextlib.suppress(ImportError):
+            gym.register_envs(import_module("gymnasium_robotics"))
     return gym.spec(name)
 
 
+def registered_id(env_id: str) -> str:
+    """
+    :param env_id: id of an environment, perhaps with the module that registers it: ``"module:id"``
+    :return: the id by which it is registered
+    :raises ValueError: if it is not, or there is no such module
+    """
+    try:
+        return registered_spec(env_id).id
+    except (gym.error.Error, ImportError) as error:
+        accepted = "accepted is the id of a registered environment, or module:id with the module that registers it"
+        raise ValueError(f"env: {env_id!r} is not registered ({error}); {accepted}") from None
+
+
+def import_packages(names: Sequence[str]) -> None:
+    """
+    :param names: of modules that register environments, or hold wrappers
+    :raises ValueError: if there is no such module
+    """
+    for name in names:
+        try:
+            import_module(name)
+        except (ImportError, ValueError, TypeError) as error:  # the last two: of a name that is none
+            raise ValueError(f"--gym-packages: {name!r} cannot be imported ({error})") from None
+
+
 def make_vec_env(
-    env_id: str, n_envs: int = 1, seed: int | None = None, n_threads: int | None = None, **env_kwargs: Any
+    env_id: str | Callable[..., gym.Env],
+    n_envs: int = 1,
+    seed: int | None = None,
+    start_index: int = 0,
+    monitor_dir: str | None = None,
+    wrapper_class: Callable[..., gym.Env] | None = None,
+    env_kwargs: dict[str, Any] | None = None,
+    vec_env_cls: Callable[..., VecEnv] | None = None,
+    vec_env_kwargs: dict[str, Any] | None = None,
+    monitor_kwargs: dict[str, Any] | None = None,
+    wrapper_kwargs: dict[str, Any] | None = None,
+    *,
+    n_threads: int | None = None,
+    **more_env_kwargs: Any,
 ) -> VecEnv:
     """
-    Many environments as SB3 wants them: in one process, with ``info["episode"]`` at the end of each episode.
+    Many environments as SB3 wants them: in one process, with ``info["episode"]`` at the end of each episode. Takes what SB3's
+    ``make_vec_env`` takes.
 
     The mazes are stepped together as a :class:`~sb3_ddiffpg.envs.mazes.env.MazeVecEnv`, the arm's tasks in a few processes
-    (:class:`~sb3_ddiffpg.envs.vec_env.WorkerVecEnv`); for every other id this is SB3's ``make_vec_env``. All give the numbers
-    of environments that are stepped one after the other.
+    (:class:`~sb3_ddiffpg.envs.vec_env.WorkerVecEnv`); everything else, and whatever is to be wrapped or vectorised in another
+    way, is made by SB3's ``make_vec_env``. All give the numbers of environments that are stepped one after the other.
 
-    :param env_id: id of a registered environment, perhaps with the module that registers it: ``"module:id"``
+    :param env_id: id of a registered environment, perhaps with the module that registers it: ``"module:id"``; or a class
+        or function that makes one
     :param n_envs: number of environments
     :param seed: environment i is seeded with ``seed + i`` at the first reset
-    :param n_threads: threads of the ants' simulator, processes of the arm's; None: one per processor
+    :param start_index: number of the first environment, for its action space's seed and its monitor's file
+    :param monitor_dir: folder of the monitors' files; None: no file is written
+    :param wrapper_class: what is put around each environment and its monitor
     :param env_kwargs: arguments of ``gym.make``, such as ``max_episode_steps`` or ``maze_map``
+    :param vec_env_cls: a class of SB3's, such as ``SubprocVecEnv``
+    :param vec_env_kwargs: further arguments of ``vec_env_cls``
+    :param monitor_kwargs: further arguments of each ``Monitor``
+    :param wrapper_kwargs: further arguments of ``wrapper_class``
+    :param n_threads: threads of the ants' simulator, processes of the arm's; None: one per processor
+    :param more_env_kwargs: the same as ``env_kwargs``, for arguments that are not called as one of these here
     :return: the vectorised environment, with monitor
+    :raises ValueError: if ``n_envs`` is less than 1, or an argument of the environment is given twice
     """
-    spec = _spec(env_id)
     if n_envs < 1:
         raise ValueError(f"n_envs: {n_envs} given; accepted are whole numbers from 1 up")
-    if str(spec.entry_point).startswith(_FRANKA):
-        # The spec, not the id: the workers do not know what was registered here
-        makers: list[Any] = [partial(gym.make, spec, **env_kwargs)] * n_envs
-        workers: VecEnv = WorkerVecEnv(makers, n_threads) if n_envs > 1 else TracingDummyVecEnv(makers)
-        if seed is not None:
-            workers.action_space.seed(seed)
-        workers.seed(seed)
-        return VecMonitor(workers)
-    if spec.entry_point not in _VEC_ENVS:
-        return make_sb3_vec_env(env_id, n_envs, seed=seed, env_kwargs=env_kwargs, vec_env_cls=TracingDummyVecEnv)
-    limit = env_kwargs.pop("max_episode_steps", None) or spec.max_episode_steps
-    kwargs = {"render_mode": "rgb_array", **spec.kwargs, **env_kwargs}
-    threads = {} if n_threads is None or spec.entry_point == _POINT_MAZE else {"n_threads": n_threads}
-    make: Any = load_env_creator(_VEC_ENVS[spec.entry_point])
-    mazes = make(n_envs, max_episode_steps=limit, **kwargs, **threads)
-    mazes.spec = replace(spec, max_episode_steps=limit, kwargs=kwargs)
+    if twice := sorted(set(env_kwargs or {}) & set(more_env_kwargs)):
+        raise ValueError(f"env_kwargs: {twice} given beside the same as an argument of its own; accepted is one or the other")
+    kwargs = {**(env_kwargs or {}), **more_env_kwargs}
+    kind = str(registered_spec(env_id).entry_point) if isinstance(env_id, str) else ""
+    one_by_one = any(each is not None for each in (wrapper_class, vec_env_cls, vec_env_kwargs, monitor_kwargs, wrapper_kwargs))
+    if one_by_one or not (kind in _VEC_ENVS or kind.startswith(_FRANKA)):
+        return make_sb3_vec_env(
+            env_id,
+            n_envs,
+            seed,
+            start_index,
+            monitor_dir,
+            wrapper_class,
+            kwargs,
+            TracingDummyVecEnv if vec_env_cls is None else vec_env_cls,  # type: ignore[arg-type]
+            vec_env_kwargs,
+            monitor_kwargs,
+            wrapper_kwargs,
+        )
+    make = _arms if kind.startswith(_FRANKA) else _mazes
+    env = make(registered_spec(str(env_id)), n_envs, n_threads, kwargs)
     if seed is not None:
-        mazes.action_space.seed(seed)
-    mazes.seed(seed)
-    return VecMonitor(mazes)
+        env.action_space.seed(seed + start_index)
+    env.seed(seed)
+    return VecMonitor(env, None if monitor_dir is None else os.path.join(monitor_dir, str(start_index)))
+
+
+def _arms(spec: EnvSpec, n_envs: int, n_workers: int | None, kwargs: dict[str, Any]) -> VecEnv:
+    # The spec, not the id: the workers do not know what was registered here
+    makers: list[Any] = [partial(gym.make, spec, **kwargs)] * n_envs
+    return WorkerVecEnv(makers, n_workers) if n_envs > 1 else TracingDummyVecEnv(makers)
+
+
+def _mazes(spec: EnvSpec, n_envs: int, n_threads: int | None, kwargs: dict[str, Any]) -> VecEnv:
+    limit = kwargs.pop("max_episode_steps", None) or spec.max_episode_steps
+    kwargs = {"render_mode": "rgb_array", **spec.kwargs, **kwargs}
+    threads = {} if n_threads is None or spec.entry_point == _POINT_MAZE else {"n_threads": n_threads}
+    make: Any = load_env_creator(_VEC_ENVS[str(spec.entry_point)])
+    mazes: Any = make(n_envs, max_episode_steps=limit, **kwargs, **threads)
+    mazes.spec = replace(spec, max_episode_steps=limit, kwargs=kwargs)
+    return mazes

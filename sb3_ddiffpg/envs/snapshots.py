@@ -121,7 +121,7 @@ def awaits_seeds(env: VecEnv) -> bool:
     """
     while isinstance(env, VecEnvWrapper):
         env = env.venv
-    return any(seed is not None for seed in env._seeds)
+    return any(seed is not None for seed in getattr(env, "_seeds", ()))  # of another library it may have none
 
 
 def restore_vec_env(env: VecEnv, tree: Any) -> None:

@@ -97,7 +97,7 @@ def evaluate_ensemble(models: Sequence[Any], env: Any, n_episodes: int = 100, **
     command one is drawn for each episode. Compare it at the same cost: S models have cost S times the steps of one.
 
     :param models: SB3 models with the same spaces
-    :param env: The environments, or the id of one
+    :param env: The environments, a single one, or the id of one
     :param n_episodes: Episodes for each member, and twice as many for the union
     :param kwargs: Further arguments of ``evaluate_modes``
     :return: The evaluation

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
@@ -13,11 +14,12 @@ from sb3_ddiffpg.buffers.trajectory import NO_MODE
 from sb3_ddiffpg.clustering.dtw import dtw_distances
 from sb3_ddiffpg.clustering.linkage import cluster
 from sb3_ddiffpg.clustering.paths import comparable_path
-from sb3_ddiffpg.envs import is_ours, make_vec_env
+from sb3_ddiffpg.evaluation.environments import evaluation_environments
 from sb3_ddiffpg.evaluation.results import CommandResult, ModeEvaluation, RouteResult, command_name
-from sb3_ddiffpg.evaluation.rollout import EpisodeResult, run_episodes
+from sb3_ddiffpg.evaluation.rollout import EpisodeResult, judged, run_episodes
 from sb3_ddiffpg.modes.settings import ModeSettings
 from sb3_ddiffpg.utils.rng import preserved_rng
+from sb3_ddiffpg.utils.vec_envs import env_attribute
 
 # Of a success that is like no other
 _NO_ROUTE = ""
@@ -25,7 +27,7 @@ _NO_ROUTE = ""
 
 def evaluate_modes(
     model: Any,
-    env: VecEnv | str,
+    env: gym.Env | VecEnv | str | None = None,
     n_episodes: int = 100,
     n_uncommanded: int | None = None,
     modes: Sequence[str] | None = None,
@@ -37,18 +39,21 @@ def evaluate_modes(
     """
     Run complete episodes under each command and without any, and count which routes they took.
 
-    All should begin at one fixed start, or the start decides on the route. Given an id, the tasks of this package are made
-    without start noise; of other environments the result says how far apart their episodes started.
+    All should begin at one fixed start, or the start decides on the route. Given an id or nothing, the tasks of this package
+    are made without start noise; of other environments the result says how far apart their episodes started.
 
     :param model: Any SB3 model. What has no modes, such as a TD3, is run without commands
-    :param env: The environments, or the id of one
+    :param env: The environments, a single one, or the id of one, perhaps with the module that registers it: ``"module:id"``.
+        Where the model was trained when None: with its arguments and wrappers, if it is registered. With its id it has its
+        wrappers
     :param n_episodes: Episodes for each command
     :param n_uncommanded: Episodes without command; twice ``n_episodes`` when None
     :param modes: Names of the modes to command; all when None
-    :param listed: Labels of the routes to find; what the environment says in ``listed_modes`` when None
+    :param listed: Labels of the routes to find; what the environment says in ``listed_modes`` when None. Only where it
+        declares these, perhaps none, is ``info["mode"]`` a label
     :param deterministic: Passed to ``predict``
     :param seed: Seeds environments and actions
-    :param env_kwargs: Arguments of ``gym.make``, if ``env`` is an id
+    :param env_kwargs: Arguments of ``gym.make``, or a dict of them as ``env_kwargs``, if ``env`` is an id or None
     :return: The evaluation
     :raises ValueError: If an argument cannot work, naming it
     """
@@ -62,16 +67,9 @@ def evaluate_modes(
     for name in modes or ():
         if name not in known:
             raise ValueError(f"modes: {name!r} given; the model's modes are {known}")
-    if isinstance(env, str):
-        if is_ours(env):
-            env_kwargs = {"start_noise": 0.0, **env_kwargs}
-        made = make_vec_env(env, min(n_episodes, 25), seed=seed, **env_kwargs)
-        try:
+    if not isinstance(env, VecEnv) or env_kwargs:
+        with evaluation_environments(model, env, n_episodes, seed, **env_kwargs) as made:
             return evaluate_modes(model, made, n_episodes, n_uncommanded, modes, listed, deterministic, seed)
-        finally:
-            made.close()
-    if env_kwargs:
-        raise ValueError(f"{sorted(env_kwargs)} given; accepted beside an env that is made already are none")
     if seed is not None:
         with preserved_rng():
             set_random_seed(seed)
@@ -84,10 +82,12 @@ def evaluate_modes(
         for command in commands
         for n in [n_uncommanded if command is None else n_episodes]
     ]
+    told = any(episode.success is not None for run in runs for episode in run)
+    runs = [judged(run, told) for run in runs]
     if listed is None:
-        listed = env.get_attr("listed_modes", indices=0)[0] if env.has_attr("listed_modes") else ()
+        listed = env_attribute(env, "listed_modes") or ()
     labels, source = _labels(model, runs)
-    spec = env.get_attr("spec", indices=0)[0] if env.has_attr("spec") else None
+    spec = env_attribute(env, "spec")
     results = [_count(command, run, names) for command, run, names in zip(commands, runs, labels, strict=True)]
     starts = np.array([episode.path[0] for run in runs for episode in run])
     return ModeEvaluation(
@@ -98,6 +98,7 @@ def evaluate_modes(
         uncommanded=results[-1],
         commanded=tuple(results[:-1]),
         routes=_routes(runs, labels),
+        success_told=any(episode.success is not None for run in runs for episode in run),
         episodes={command_name(command): run for command, run in zip(commands, runs, strict=True)},
     )
 

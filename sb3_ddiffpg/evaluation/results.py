@@ -74,13 +74,14 @@ class ModeEvaluation:
     What ``evaluate_modes`` found. Prints as a table.
 
     :param env_id: Of the environment, or what it is
-    :param label_source: ``"environment"`` (``info["mode"]``), or ``"clustering"`` of these episodes' paths, where it gives no
-        labels: then modes are counted by the same rule by which they were found
+    :param label_source: ``"environment"`` (``info["mode"]``, where it declares ``listed_modes``), or ``"clustering"`` of these
+        episodes' paths, where it gives no labels: then modes are counted by the same rule by which they were found
     :param listed: Routes that the environment names as those to find; empty if it names none
     :param start_spread: Largest distance between two episodes' starts, in units of the mode features
     :param uncommanded: Episodes in which the model chose for itself
     :param commanded: Those under each command
     :param routes: The routes that were taken
+    :param success_told: Whether the environment says what a success is; where it does not, every episode counts as one
     :param episodes: All episodes by command, ``"(none)"`` without; not saved
     """
 
@@ -91,6 +92,7 @@ class ModeEvaluation:
     uncommanded: CommandResult
     commanded: tuple[CommandResult, ...]
     routes: tuple[RouteResult, ...]
+    success_told: bool = True
     episodes: dict[str, list[EpisodeResult]] = field(default_factory=dict, compare=False, repr=False)
 
     def expected_modes(self, n_draws: int = 20) -> float:

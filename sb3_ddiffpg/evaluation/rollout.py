@@ -1,13 +1,17 @@
 """Complete episodes of a trained model: what each came to, and on which route."""
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_ddiffpg.buffers.features import ModeFeatures
-from sb3_ddiffpg.buffers.success import read_success
+from sb3_ddiffpg.buffers.features import ModeFeatures, declared_mode_features
+from sb3_ddiffpg.buffers.success import GoalWatch
+from sb3_ddiffpg.evaluation.environments import evaluation_environments
+from sb3_ddiffpg.utils.vec_envs import env_attribute, labels_routes
 
 
 @dataclass
@@ -15,11 +19,12 @@ class EpisodeResult:
     """
     One complete episode.
 
-    :param success: Whether the goal was reached, None if the environment does not say
-    :param length: Number of steps
-    :param episode_return: Sum of rewards
-    :param label: Ground-truth mode, ``info["mode"]`` of the last step, None if the environment gives none
-    :param path: Mode features along the episode, terminal state included, shape [length + 1, dim]
+    :param success: Whether the goal was reached, at its last step or before; None if the environment does not say
+    :param length: Number of steps, to the goal if it was reached
+    :param episode_return: Sum of rewards, after the goal too
+    :param label: Ground-truth mode, ``info["mode"]`` where the goal was reached or the episode ended, None if the environment
+        gives none or declares no ``listed_modes``
+    :param path: Mode features along these steps, terminal state included, shape [length + 1, dim]
     """
 
     success: bool | None
@@ -30,31 +35,35 @@ class EpisodeResult:
 
 
 def run_episodes(
-    model: Any, env: VecEnv, n_episodes: int, mode: str | int | None = None, deterministic: bool = False
+    model: Any, env: gym.Env | VecEnv | str, n_episodes: int, mode: str | int | None = None, deterministic: bool = False
 ) -> list[EpisodeResult]:
     """
     Run complete episodes. Every environment contributes its first ones, the same number (give or take one): taking
     whichever end first would favour short episodes.
 
     :param model: An SB3 model; if it has modes, ``mode`` commands one
-    :param env: Vectorised environment; its episodes should start where modes are to be compared
+    :param env: Vectorised environments, a single one, or the id of one; episodes should start where modes are to be compared
     :param n_episodes: Number of episodes
     :param mode: Mode to command; None: the model draws one for each episode, if it has modes
     :param deterministic: Passed to ``predict``
     :return: ``n_episodes`` results, ordered by environment
-    :raises ValueError: If ``env`` is not vectorised or ``n_episodes`` no number of episodes
+    :raises ValueError: If ``env`` is no environment or ``n_episodes`` no number of episodes
     """
-    if not isinstance(env, VecEnv):
-        raise ValueError(f"env must be a VecEnv, such as sb3_ddiffpg.envs.make_vec_env makes, got {env}")
     if not isinstance(n_episodes, (int, np.integer)) or n_episodes < 1:
         raise ValueError(f"n_episodes must be an integer of at least 1, got {n_episodes!r}")
+    if not isinstance(env, VecEnv):
+        with evaluation_environments(model, env, n_episodes) as made:
+            return run_episodes(model, made, n_episodes, mode, deterministic)
     share = np.array([n_episodes // env.num_envs + (i < n_episodes % env.num_envs) for i in range(env.num_envs)])
     selection = getattr(model, "resolved_features", None)
-    if selection is None and env.has_attr("mode_features"):
-        selection = env.get_attr("mode_features", indices=0)[0]
+    if selection is None and env_attribute(env, "mode_features") is not None:
+        with suppress(ValueError):  # of what wrappers have made unknown: the whole observation
+            selection = declared_mode_features(env)
     features = ModeFeatures(env.observation_space, selection)
     command = {} if mode is None else {"mode": mode}
     results: list[list[EpisodeResult]] = [[] for _ in range(env.num_envs)]
+    watch = GoalWatch(env.num_envs, getattr(model, "success_key", None), labels_routes(env))
+    watch.has_signal = knows_success(model)
     # Positions are compared in metres, whatever a normalising wrapper shows the networks
     normalizer = unwrap_vec_normalize(env)
     was_training = normalizer is not None and normalizer.training
@@ -67,6 +76,7 @@ def run_episodes(
     while any(len(done) < wanted for done, wanted in zip(results, share, strict=True)):
         actions, state = model.predict(obs, state=state, episode_start=starts, deterministic=deterministic, **command)
         obs, rewards, starts, infos = env.step(actions)
+        watch.observe(infos)
         returns += rewards if normalizer is None else normalizer.get_original_reward()
         positions = features(obs if normalizer is None else normalizer.get_original_obs())  # type: ignore[arg-type]
         for i in range(env.num_envs):
@@ -79,10 +89,33 @@ def run_episodes(
                 is_dict = isinstance(terminal, dict)
                 batch = {key: value[None] for key, value in terminal.items()} if is_dict else np.asarray(terminal)[None]
                 paths[i].append(features(batch)[0])
-            success = read_success(infos[i], getattr(model, "success_key", None))
-            episode = EpisodeResult(success, len(paths[i]) - 1, float(returns[i]), infos[i].get("mode"), np.stack(paths[i]))
-            results[i].append(episode)
+            success, length, label = watch.so_far(i, infos[i])
+            path = np.stack(paths[i][: length + 1])
+            results[i].append(EpisodeResult(success, len(path) - 1, float(returns[i]), label, path))
+            watch.end(i)
             paths[i], returns[i] = [positions[i]], 0.0
     if normalizer is not None:
         normalizer.training = was_training
-    return [episode for done, wanted in zip(results, share, strict=True) for episode in done[:wanted]]
+    found = [episode for done, wanted in zip(results, share, strict=True) for episode in done[:wanted]]
+    return judged(found, watch.has_signal)
+
+
+def judged(episodes: list[EpisodeResult], success_is_told: bool) -> list[EpisodeResult]:
+    """
+    Some environments speak of success only where there is one.
+
+    :param episodes: Of which some may say nothing of success
+    :param success_is_told: Whether others, or the training, have said what one is
+    :return: The same; those that say nothing have failed, if it is told
+    """
+    return [replace(each, success=bool(each.success)) for each in episodes] if success_is_told else episodes
+
+
+def knows_success(model: Any) -> bool:
+    """
+    :param model: Any model
+    :return: Whether the environments of its training have said what a success is
+    """
+    members = getattr(model, "models", None) or [getattr(model, "model", model)]  # of an ensemble, or of a Replanner
+    buffers = [getattr(each, "replay_buffer", None) for each in members]
+    return any(getattr(buffer, "has_success_signal", False) for buffer in buffers)

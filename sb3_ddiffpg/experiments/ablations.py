@@ -1,6 +1,7 @@
 """DDiffPG with one of its parts made useless, for comparison only: what the part is good for."""
 
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -8,6 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_ddiffpg.ddiffpg import DDiffPG, DiffusionPolicy
 from sb3_ddiffpg.modes.manager import ModeManager
+from sb3_ddiffpg.saving.algorithm import SavableAlgorithm
 from sb3_ddiffpg.zoo import ALGO, ALGOS
 from sb3_ddiffpg.zoo import register as register_in_zoo
 
@@ -25,7 +27,9 @@ class ShuffledEmbeddingsPolicy(DiffusionPolicy):
 class ShuffledEmbeddings(DDiffPG):
     """DDiffPG with a ``ShuffledEmbeddingsPolicy``."""
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(DDiffPG.policy_aliases, ShuffledEmbeddingsPolicy)
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        name: ShuffledEmbeddingsPolicy for name, policy in DDiffPG.policy_aliases.items() if policy is DiffusionPolicy
+    }
 
 
 class RandomClusterManager(ModeManager):
@@ -53,6 +57,19 @@ def register() -> None:
     """Make this package's algorithms and the ablations known to the zoo."""
     register_in_zoo()
     ALGOS.update(ABLATIONS)
+
+
+def load_to_act(algo: str, path: Path) -> Any:
+    """
+    :param algo: Name of an algorithm
+    :param path: Of its model
+    :return: The model. One of SB3's own has no replay buffer worth the name: one for goals needs an environment
+    """
+    algorithm: Any = ALGOS[algo]
+    if issubclass(algorithm, SavableAlgorithm):
+        return algorithm.load(path)
+    no_buffer: dict[str, Any] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
+    return algorithm.load(path, custom_objects=no_buffer)
 
 
 def settings_file(algo: str) -> str:

@@ -9,9 +9,8 @@ from typing import Any
 import yaml
 
 from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm
-from sb3_ddiffpg.experiments.ablations import register
+from sb3_ddiffpg.experiments.ablations import load_to_act, register
 from sb3_ddiffpg.experiments.store import Recorded, read_training
-from sb3_ddiffpg.zoo import ALGOS
 
 try:
     from huggingface_hub import EvalResult, HfApi, ModelCard, ModelCardData
@@ -34,7 +33,7 @@ def write_card(folder: Path, repo_id: str) -> Path:
     """
     run = _read(folder)
     found = run.evaluation
-    model = ALGOS[run.trial.algo].load(folder / "model.zip")
+    model = load_to_act(run.trial.algo, folder / "model.zip")
     if isinstance(model, ActorCriticAlgorithm):
         model.export(folder / SAFE_MODEL)
     data = ModelCardData(

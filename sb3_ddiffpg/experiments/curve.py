@@ -15,6 +15,7 @@ from sb3_ddiffpg.callbacks.evaluation import EvaluateModesCallback
 from sb3_ddiffpg.evaluation.results import ModeEvaluation
 from sb3_ddiffpg.experiments.wall_clock import Stopwatch
 from sb3_ddiffpg.serialization.safetensors_tree import convert
+from sb3_ddiffpg.utils.vec_envs import labels_routes, route_label
 
 #: Column of the goals reached in training by a route, before its label
 REACHED = "reached "
@@ -68,10 +69,20 @@ class CurveCallback(EvaluateModesCallback):
         self.stopwatch = Stopwatch()
 
     def _on_step(self) -> bool:
-        for done, info in zip(self.locals["dones"], self.locals["infos"], strict=True):
-            if done and info.get("mode") is not None and read_success(info, getattr(self.model, "success_key", None)):
-                self.reached[str(info["mode"])] += 1
+        for env, (done, info) in enumerate(zip(self.locals["dones"], self.locals["infos"], strict=True)):
+            label = self._reached(env, info) if done else None
+            if label is not None:
+                self.reached[label] += 1
         return super()._on_step()
+
+    def _reached(self, env: int, info: dict[str, Any]) -> str | None:
+        """Route by which an episode has reached its goal, with the step that ends it, which is not stored yet."""
+        said = read_success(info, getattr(self.model, "success_key", None))
+        rule = getattr(self.model.replay_buffer, "success_rule", None)  # type: ignore[attr-defined]
+        if rule is None:  # SB3's own buffers know the last step alone
+            return route_label(info, labels_routes(self.training_env)) if said else None
+        before = rule.so_far(env, info)
+        return before.label if before.success or said else None
 
     def _on_training_end(self) -> None:
         if not self.evaluations or self.evaluations[-1][0] < self.num_timesteps:
@@ -90,7 +101,8 @@ class CurveCallback(EvaluateModesCallback):
             "commanded_modes": round(found.commanded_modes, 3),
             "expected_modes": round(found.expected_modes(), 3),
             "robust_modes": found.robust_modes,
-            "success_rate": round(found.uncommanded.success_rate, 3),
+            "success_rate": round(found.uncommanded.success_rate, 3) if found.success_told else "",
+            "mean_return": round(found.uncommanded.mean_return, 4),
         }
         for label in self._labels(found):
             shares = [each.labels.get(label, 0) / each.n_episodes for each in (*found.commanded, found.uncommanded)]

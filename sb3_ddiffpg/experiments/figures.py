@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import seaborn as sns
@@ -11,10 +12,12 @@ from matplotlib.ticker import EngFormatter
 
 from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm
 from sb3_ddiffpg.envs import is_ours, make_vec_env
+from sb3_ddiffpg.experiments.ablations import register
 from sb3_ddiffpg.experiments.store import Recorded, by, task_of, variant_of
 from sb3_ddiffpg.experiments.summary import MEASURES, over_tasks, seconds_per_update
 from sb3_ddiffpg.experiments.trial import setting_of
 from sb3_ddiffpg.experiments.wall_clock import PARTS
+from sb3_ddiffpg.utils.vec_envs import env_attribute
 from sb3_ddiffpg.visualization import plots
 from sb3_ddiffpg.zoo import ALGOS
 
@@ -24,6 +27,7 @@ _N_PLACES = 60
 _MOST_LINES = 12
 _LABELS = {
     "success_rate": "success, uncommanded",
+    "mean_return": "return, uncommanded",
     "expected_modes": "modes expected in 20 episodes",
     "commanded_modes": "modes that can be commanded",
     "cells": "known cells",
@@ -67,7 +71,8 @@ def curves(runs: Sequence[Recorded], measure: str, against: str = "step") -> Fig
         hues = dict.fromkeys(colors, "C0") if apart else colors  # alone in its panel
         sns.lineplot(data, x=against, y=measure, hue="variant", palette=hues, ax=axes, errorbar=("pi", 100), legend=False)
         axes.set(title=title, xlabel={"step": "environment steps"}.get(against, against), ylabel=_LABELS.get(measure, measure))
-        axes.set_ylim(0, 1.03 if measure == "success_rate" else None)
+        if measure != "mean_return":
+            axes.set_ylim(0, 1.03 if measure == "success_rate" else None)
         if against == "step":
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     if not apart:
@@ -82,8 +87,9 @@ def _interpolated(runs: Sequence[Recorded], measure: str, against: str) -> pd.Da
     parts = []
     for run in runs:
         known = run.curve[[against, measure]].dropna()
-        # Before its first test nothing had been reached
-        xs, ys = np.append(0, known[against]), np.append(0, known[measure])
+        # Before its first test nothing had been reached; what an untrained model is paid is not known
+        first = known[measure].iloc[0] if measure == "mean_return" else 0
+        xs, ys = np.append(0, known[against]), np.append(first, known[measure])
         parts.append(pd.DataFrame({against: places, measure: np.interp(places, xs, ys), "variant": variant_of(run)}))
     return pd.concat(parts, ignore_index=True)
 
@@ -159,23 +165,21 @@ class Maps:
     """
 
     def __init__(self, runs: Sequence[Recorded]) -> None:
-        firsts = {variant: own[0] for variant, own in by(variant_of, runs).items()}
-        shown = {
-            variant: run
-            for variant, run in firsts.items()
-            if (run.folder / "model.zip").is_file() and issubclass(ALGOS[run.trial.algo], ActorCriticAlgorithm)
-        }
-        self.models: dict[str, Any] = {
-            variant: ALGOS[run.trial.algo].load(_final_model(run)) for variant, run in shown.items()
-        }
         self.maze: Any = None
         self.observation: Any = None
+        self.models: dict[str, Any] = {}
         settings = runs[0].trial.hyperparams
-        if is_ours(task_of(runs[0])) and not settings.get("env_wrapper"):
-            env = make_vec_env(task_of(runs[0]), 1, seed=0, **settings.get("env_kwargs", {}))
-            self.maze = env.get_attr("maze", indices=0)[0] if env.has_attr("maze") else None
-            self.observation = env.reset()
-            env.close()
+        if not _is_ours_here(task_of(runs[0])) or settings.get("env_wrapper"):
+            return
+        env = make_vec_env(task_of(runs[0]), 1, seed=0, env_kwargs=settings.get("env_kwargs"))
+        self.maze = env_attribute(env, "maze")
+        self.observation = env.reset()
+        env.close()
+        register()
+        for variant, own in by(variant_of, runs).items():
+            algorithm = ALGOS[own[0].trial.algo]
+            if (own[0].folder / "model.zip").is_file() and issubclass(algorithm, ActorCriticAlgorithm):
+                self.models[variant] = algorithm.load(_final_model(own[0]))
 
     def exploration(self) -> Figure | None:
         """
@@ -212,6 +216,14 @@ class Maps:
             figure.colorbar(image, ax=axes)
             axes.set_title(variant)
         return figure
+
+
+def _is_ours_here(env_id: str) -> bool:
+    """A report is made without what the trainings needed."""
+    try:
+        return is_ours(env_id)
+    except (gym.error.Error, ImportError):
+        return False
 
 
 def _final_model(run: Recorded) -> Any:

@@ -49,10 +49,10 @@ def read_yaml(name: str, path: Path) -> Any:
 
 def task_file_name(task: str) -> str:
     """
-    :param task: Name of an environment, with its namespace if it has one
-    :return: Name of it for files and folders
+    :param task: Name of an environment, with its module and namespace if it has them
+    :return: Name of it for files and folders, without the module
     """
-    return task.replace("/", "-")
+    return task.rpartition(":")[2].replace("/", "-")
 
 
 def check_output(folder: Path) -> None:

@@ -67,6 +67,7 @@ def make_report(
     elsewhere = elsewhere_table(runs)
     text = environment.get_template("results.md").render(
         title=title,
+        last=all(run.trial.tests.last for run in runs),
         machines=_machines(runs),
         incomplete=[str(folder.relative_to(results)) for folder in incomplete],
         tasks={task: _table(task_table(own)) for task, own in by(task_of, runs).items()},
@@ -112,6 +113,7 @@ class _Drawn:
 def _draw(drawn: _Drawn, runs: Sequence[Recorded], setting: str | None) -> None:
     for measure, name in (
         ("success_rate", "Success without command"),
+        ("mean_return", "Mean return without command"),
         ("expected_modes", "Routes expected in 20 episodes without command"),
         ("commanded_modes", "Routes that can be commanded"),
         ("cells", "Known cells"),
@@ -131,10 +133,10 @@ def _draw(drawn: _Drawn, runs: Sequence[Recorded], setting: str | None) -> None:
     if any(seconds_per_update(run) is not None for run in runs):
         drawn.add("wall_clock", "Time of 1000 updates and the collection between them, by part.", figures.wall_clock(runs))
     for task, own in by(task_of, runs).items():
-        maps = figures.Maps(own)
-        drawn.add(f"exploration_{task}", f"{task}: where training went (first seed), by cell.", maps.exploration())
+        maps, place = figures.Maps(own), task_file_name(task)
+        drawn.add(f"exploration_{place}", f"{task}: where training went (first seed), by cell.", maps.exploration())
         text = f"{task}: what the critics expect, of reward and novelty, of DDiffPG of its best mode's reward alone"
-        drawn.add(f"values_{task}", f"{text} (first seed, last model; each panel has its own scale).", maps.values())
+        drawn.add(f"values_{place}", f"{text} (first seed, last model; each panel has its own scale).", maps.values())
 
 
 def _table(frame: pd.DataFrame) -> str:

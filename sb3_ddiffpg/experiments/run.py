@@ -170,6 +170,10 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
         raise ValueError(f"--workers: {given.workers} given beside --ray {given.ray}; accepted is one of both")
     folder = given.out.resolve()
     check_output(folder)
+    for task, needed in suite.leave_out().items():
+        print(f"{task} is left out; it needs: pip install {needed}", flush=True)
+    if not suite.tasks:
+        raise ValueError("tasks: none of those that are asked for can be made with what is installed")
     missing = missing_trials(suite, folder)
     print(f"{suite.description}\n{len(missing)} of {suite.n_trials} trials to run", flush=True)
     commits = Counter(read_record(folder / place).get("git_commit") for place in suite.trials().keys() - missing.keys())

@@ -122,10 +122,12 @@ def _of_files(folder: Path, record: dict[str, Any], curve: Path, elsewhere: list
 
 
 def _last_success(folder: Path, result: dict[str, Any], best: ModeEvaluation) -> float:
+    path, last = folder / "logs" / "evaluation_final.json", None
     if result.get("best_step") == result["steps"]:
-        return best.uncommanded.success_rate
-    path = folder / "logs" / "evaluation_final.json"
-    return ModeEvaluation.load(path).uncommanded.success_rate if path.is_file() else float("nan")
+        last = best
+    elif path.is_file():
+        last = ModeEvaluation.load(path)
+    return last.uncommanded.success_rate if last is not None and last.success_told else float("nan")
 
 
 def check_alike(runs: Sequence[Recorded]) -> None:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from sb3_ddiffpg.experiments.files import read_yaml, task_file_name
-from sb3_ddiffpg.experiments.trial import Tests, Trial, hyperparameters, setting_of
+from sb3_ddiffpg.experiments.trial import Tests, Trial, can_be_made, hyperparameters, setting_of
 from sb3_ddiffpg.zoo import ALGO
 
 T = TypeVar("T")
@@ -24,12 +24,16 @@ class Variant(msgspec.Struct, forbid_unknown_fields=True):
     :param conf_file: YAML file of settings; the suite's when None, else the algorithm's own
     :param settings: What differs from its entry there
     :param members: More than one: see ``Trial``
+    :param entries: Task -> the entry of the RL zoo's file (``conf_file: rl_zoo3``) that it takes, if not its own
+    :param tasks: Task -> what differs there for this variant alone
     """
 
     algo: str = ALGO
     conf_file: str | None = None
     settings: dict[str, Any] = {}
     members: int = 1
+    entries: dict[str, str] = {}
+    tasks: dict[str, dict[str, Any]] = {}
 
 
 class Resources(msgspec.Struct, forbid_unknown_fields=True):
@@ -58,6 +62,7 @@ class Suite(msgspec.Struct, forbid_unknown_fields=True):
     :param also: Task -> further environments in which what was trained there is evaluated
     :param resources: What one trial takes
     :param ablation: The setting in which the variants differ, for a figure over its values
+    :param needs: Task -> what pip installs for it; such a task is left out where it is not
     """
 
     description: str
@@ -70,6 +75,7 @@ class Suite(msgspec.Struct, forbid_unknown_fields=True):
     also: dict[str, list[str]] = {}
     resources: Resources = msgspec.field(default_factory=Resources)
     ablation: str | None = None
+    needs: dict[str, str] = {}
 
     @property
     def n_trials(self) -> int:
@@ -94,15 +100,29 @@ class Suite(msgspec.Struct, forbid_unknown_fields=True):
             raise ValueError(f"ablation: {self.ablation!r} given; accepted is a setting that is a number in every variant")
         return found
 
+    def leave_out(self) -> dict[str, str]:
+        """
+        Leave out the tasks that cannot be made with what is installed.
+
+        :return: These, and what they need
+        """
+        kwargs = {task: {**self.settings, **(self.tasks[task] or {})}.get("env_kwargs", {}) for task in self.tasks}
+        out = {task: self.needs[task] for task in self.tasks if task in self.needs and not can_be_made(task, kwargs[task])}
+        self.tasks = {task: settings for task, settings in self.tasks.items() if task not in out}
+        return out
+
     def _trial(self, task: str, name: str, seed: int) -> Trial:
         variant = self.variants[name]
-        changes = self.settings, self.tasks[task] or {}, variant.settings
+        changes = self.settings, self.tasks[task] or {}, variant.settings, variant.tasks.get(task, {})
+        settings = hyperparameters(
+            variant.algo, task, variant.conf_file or self.conf_file, *changes, entry=variant.entries.get(task)
+        )
         return Trial(
             env=task,
             algo=variant.algo,
             variant=name,
             seed=seed,
-            hyperparams=hyperparameters(variant.algo, task, variant.conf_file or self.conf_file, *changes),
+            hyperparams=settings,
             members=variant.members,
             tests=msgspec.structs.replace(self.tests, also=[*self.tests.also, *self.also.get(task, [])]),
         )
@@ -138,7 +158,9 @@ def read_suite(
     for variant, of_variant in variants_said.items() if isinstance(variants_said, dict) else ():
         _convert(of_variant, Variant, f"{path}: variant {variant!r}")
     suite = _convert(said, Suite, str(path))
-    _chosen("also", suite.tasks, list(suite.also))
+    of_tasks = [suite.also, suite.needs, *(each for of in suite.variants.values() for each in (of.entries, of.tasks))]
+    for names in of_tasks:
+        _chosen("tasks", suite.tasks, list(names))
     suite.tasks = _chosen("tasks", suite.tasks, tasks)
     suite.variants = _chosen("variants", suite.variants, variants)
     suite.also = {task: others for task, others in suite.also.items() if task in suite.tasks}

@@ -29,7 +29,8 @@ MEASURES: dict[str, Callable[[ModeEvaluation], float]] = {
     "robust modes": lambda found: found.robust_modes,
     "commanded modes": lambda found: found.commanded_modes,
     "coverage": lambda found: found.coverage,
-    "success": lambda found: found.uncommanded.success_rate,
+    "success": lambda found: found.uncommanded.success_rate if found.success_told else float("nan"),
+    "return": lambda found: found.uncommanded.mean_return,
     "length": lambda found: found.uncommanded.mean_length,
 }
 
@@ -132,9 +133,15 @@ def over_tasks(runs: Sequence[Recorded], measure: str) -> dict[str, tuple[float,
     """
     :param runs: Trainings
     :param measure: One of ``MEASURES``
-    :return: Variant -> interquartile mean over tasks and seeds and its interval, for the variants that have every task; of
-        each, as many seeds as the task with fewest has
+    :return: Variant -> interquartile mean over tasks and seeds and its interval, for the variants that have every task that
+        has such a number; of each, as many seeds as the task with fewest has
     """
+    runs = [
+        run
+        for task in by(task_of, runs).values()
+        if not np.isnan([MEASURES[measure](run.evaluation) for run in task]).all()
+        for run in task
+    ]
     n_tasks, found = len(by(task_of, runs)), {}
     for variant, own in by(variant_of, runs).items():
         tasks = list(by(task_of, own).values())

@@ -22,12 +22,12 @@ from stable_baselines3.common.vec_env import VecNormalize, sync_envs_normalizati
 from sb3_ddiffpg.callbacks.checkpoint import RunCheckpointCallback
 from sb3_ddiffpg.callbacks.evaluation import score
 from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm
-from sb3_ddiffpg.envs import is_ours, make_vec_env
+from sb3_ddiffpg.envs import import_packages, is_ours, make_vec_env, registered_id, registered_spec
 from sb3_ddiffpg.evaluation.ensemble import evaluate_ensemble
 from sb3_ddiffpg.evaluation.evaluate import evaluate_modes
 from sb3_ddiffpg.evaluation.replanner import Replanner
 from sb3_ddiffpg.evaluation.results import ModeEvaluation
-from sb3_ddiffpg.experiments.ablations import register
+from sb3_ddiffpg.experiments.ablations import load_to_act, register
 from sb3_ddiffpg.experiments.curve import CurveCallback
 from sb3_ddiffpg.experiments.files import check_output, parse_yaml, task_file_name
 from sb3_ddiffpg.experiments.progress import Progress, ProgressCallback, write_progress
@@ -89,12 +89,12 @@ class _Training:
     def run(self) -> None:
         """Train and evaluate, or go on with that."""
         entry = self.logs / "hyperparams.yml"
-        entry.write_text(yaml.safe_dump({self.trial.env: self.trial.hyperparams}))
+        entry.write_text(yaml.safe_dump({registered_id(self.trial.env): self.trial.hyperparams}))
         checkpoints = self.logs / "checkpoints"
         manager = ModeExperimentManager(
             argparse.Namespace(),
             self.trial.algo,
-            self.trial.env,
+            registered_id(self.trial.env),
             str(self.logs),
             seed=self.trial.seed,
             config=str(entry),
@@ -118,7 +118,8 @@ class _Training:
         test_env = manager.create_envs(tests.n_test_episodes, eval_env=True)
         test_env.seed(self.trial.seed + 500)
         every = max(1, manager.n_timesteps // tests.n_tests)
-        curve = CurveCallback(self.folder, eval_env=test_env, eval_freq=every, n_episodes=tests.n_test_episodes)
+        how = {"n_episodes": tests.n_test_episodes, "deterministic": tests.deterministic}
+        curve = CurveCallback(self.folder, eval_env=test_env, eval_freq=every, **how)
         # The zoo tells the first one when it was interrupted
         manager.callbacks.insert(0, curve)
         manager.callbacks.append(ProgressCallback(self.logs, manager.n_timesteps))
@@ -145,8 +146,8 @@ class _Training:
             assert trained_in is not None
             sync_envs_normalization(trained_in, test_env)  # a resumed training may not have tested since
         model.save(self.logs / "final_model.zip")
-        if curve.best_step is None:
-            shutil.copy(self.logs / "final_model.zip", self.folder / "model.zip")
+        if curve.best_step is None or tests.last:
+            self._keep_final(model)
             result["best_step"] = model.num_timesteps
         elif curve.best_step < model.num_timesteps and self._final_is_better(model, test_env):
             result["best_step"] = model.num_timesteps
@@ -162,20 +163,25 @@ class _Training:
         final, best = (score(self._tested(path, test_env, seed)[1]) for path in paths)
         if final < best:
             return False
+        self._keep_final(model)
+        return True
+
+    def _keep_final(self, model: Any) -> None:
+        """In place of the one that did best in a test."""
         unfinished = self.logs / "model.zip"
-        shutil.copy(paths[0], unfinished)
-        os.replace(unfinished, paths[1])
+        shutil.copy(self.logs / "final_model.zip", unfinished)
+        os.replace(unfinished, self.folder / "model.zip")
         if (normalizer := model.get_vec_normalize_env()) is not None:
             normalizer.save(str(self.folder / "vecnormalize.pkl"))
-        return True
 
     def _tested(self, path: Path, test_env: Any, seed: int) -> tuple[Any, ModeEvaluation]:
         """The model of a file, and what was found of it."""
         statistics, env = path.with_name("vecnormalize.pkl"), test_env
         if isinstance(test_env, VecNormalize) and statistics.exists():  # beside the best model only
             env = VecNormalize.load(str(statistics), test_env.venv)
-        model: Any = ALGOS[self.trial.algo].load(path)
-        return model, evaluate_modes(model, env, self.trial.tests.n_episodes, seed=seed)
+        model = load_to_act(self.trial.algo, path)
+        tests = self.trial.tests
+        return model, evaluate_modes(model, env, tests.n_episodes, seed=seed, deterministic=tests.deterministic)
 
     def _evaluate(self, test_env: Any, env_kwargs: dict[str, Any], final_is_best: bool) -> None:
         seed = self.trial.seed + 1_000
@@ -196,7 +202,7 @@ class _Training:
 
     def _evaluate_elsewhere(self, model: Any, env_id: str, seed: int, env_kwargs: dict[str, Any]) -> ModeEvaluation:
         n_episodes = self.trial.tests.n_episodes
-        env = make_vec_env(env_id, min(n_episodes, 25), seed=seed, **env_kwargs)
+        env = make_vec_env(env_id, min(n_episodes, 25), seed=seed, env_kwargs=env_kwargs)
         try:
             agent = Replanner(model) if len(getattr(model, "modes", ())) else model
             return evaluate_modes(agent, env, n_episodes, n_uncommanded=n_episodes, seed=seed)
@@ -227,10 +233,10 @@ def _run_union(trial: Trial, folder: Path) -> None:
         place = folder / f"member_{number}"
         run_trial(member, place)
         results.append(read_record(place)["result"])
-        models.append(ALGOS[trial.algo].load(place / "model.zip"))
+        models.append(load_to_act(trial.algo, place / "model.zip"))
         write_progress(folder / "logs", Progress(steps * (number + 1), steps * trial.members))
     env_kwargs = trial.hyperparams.get("env_kwargs", {})
-    found = evaluate_ensemble(models, trial.env, trial.tests.n_episodes, seed=trial.seed + 1_000, **env_kwargs)
+    found = evaluate_ensemble(models, trial.env, trial.tests.n_episodes, seed=trial.seed + 1_000, env_kwargs=env_kwargs)
     found.save(folder / "evaluation.json")
     print(f"\nunion\n{found}")
     record["result"] = {
@@ -261,7 +267,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     :param parser: Of the command line
     """
     parser.add_argument("--algo", help=f"{ALGO} if not given")
-    parser.add_argument("--env")
+    parser.add_argument("--env", help="id of the environment, or module:id with the module that registers it")
+    parser.add_argument("--gym-packages", nargs="+", help="modules that register environments; the record says module:id")
     parser.add_argument("--seed", type=int, help="0 if not given")
     parser.add_argument("--variant", help="name under which the result is reported; the algorithm's if not given")
     parser.add_argument(
@@ -286,7 +293,7 @@ def prepare(given: argparse.Namespace) -> Callable[[], None]:
     check_output(given.out)
     if (given.env is None) == (given.again is None):
         raise ValueError("--env or --again is needed, and not both")
-    others = ("algo", "seed", "variant", "conf_file", "override", "settings", "members", "tests")
+    others = ("algo", "gym_packages", "seed", "variant", "conf_file", "override", "settings", "members", "tests")
     if given.again is not None and (beside := [name for name in others if getattr(given, name) is not None]):
         raise ValueError(f"--again: given beside {', '.join(beside)}; a recorded training is done again as it was")
     trial = recorded_trial(given.again) if given.again is not None else _asked_for(given)
@@ -301,8 +308,9 @@ def _asked_for(given: argparse.Namespace) -> Trial:
     algo = given.algo or ALGO
     if algo not in ALGOS:
         raise ValueError(f"--algo: {algo!r} given; accepted are {', '.join(sorted(ALGOS))}")
+    env = _with_module(given.env, given.gym_packages or [])
     if given.settings is None:
-        settings = hyperparameters(algo, given.env, given.conf_file, given.override or {})
+        settings = hyperparameters(algo, env, given.conf_file, given.override or {})
     elif given.conf_file is None and not given.override:
         settings = given.settings
     else:
@@ -312,7 +320,7 @@ def _asked_for(given: argparse.Namespace) -> Trial:
     except msgspec.ValidationError as error:
         raise ValueError(f"--tests: {error}") from None
     return Trial(
-        env=given.env,
+        env=env,
         algo=algo,
         variant=algo if given.variant is None else given.variant,
         seed=given.seed or 0,
@@ -320,6 +328,21 @@ def _asked_for(given: argparse.Namespace) -> Trial:
         members=1 if given.members is None else given.members,
         tests=tests,
     )
+
+
+def _with_module(env_id: str, packages: list[str]) -> str:
+    """Whoever does the same again has to import the same."""
+    import_packages(packages)
+    if not packages or ":" in env_id:
+        return env_id
+    registered_id(env_id)
+    maker = str(registered_spec(env_id).entry_point).partition(":")[0]
+    of_it = [each for each in packages if maker.partition(".")[0] == each.partition(".")[0]]
+    if len(packages) > 1 and len(of_it) != 1:
+        raise ValueError(
+            f"--gym-packages: {packages} given, but which of them registers {env_id}? Accepted is --env module:id"
+        )
+    return f"{(of_it or packages)[0]}:{env_id}"
 
 
 def _settings(text: str) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """What is to be trained, and how it is tested."""
 
-import importlib
 import math
 import re
 import reprlib
@@ -10,12 +9,15 @@ from typing import Any
 
 import gymnasium as gym
 import msgspec
+import rl_zoo3
 import yaml
 
+from sb3_ddiffpg.common.presets import ZOO_KEYS
+from sb3_ddiffpg.envs import registered_id
 from sb3_ddiffpg.experiments.ablations import register, settings_file
 from sb3_ddiffpg.experiments.files import read_yaml
 from sb3_ddiffpg.saving.algorithm import SavableAlgorithm
-from sb3_ddiffpg.utils.arguments import check_arguments, grouped
+from sb3_ddiffpg.utils.arguments import check_arguments, constructor_arguments, grouped
 from sb3_ddiffpg.zoo import ALGOS, check_hyperparameters, config_file
 
 
@@ -27,19 +29,23 @@ class Tests(msgspec.Struct, forbid_unknown_fields=True):
     :param n_test_episodes: Episodes for each command, in each of these
     :param n_episodes: Episodes for each command in the evaluation at the end
     :param also: Further environments for that evaluation, such as ``AntMazeRandom-v0``; a model with modes replans there
+    :param deterministic: Whether actions are the most likely ones, not drawn
+    :param last: Whether the last model is evaluated, not the one that did best along the way
     """
 
     n_tests: int = 30
     n_test_episodes: int = 20
     n_episodes: int = 100
     also: list[str] = []
+    deterministic: bool = False
+    last: bool = False
 
 
 class Trial(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     """
     What is to be trained.
 
-    :param env: Id of the environment
+    :param env: Id of the environment, perhaps with the module that registers it: ``"module:id"``
     :param algo: Name of the algorithm in the zoo
     :param variant: Under which the result is reported
     :param seed: Of the training
@@ -64,10 +70,7 @@ class Trial(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
         if self.algo not in ALGOS:
             raise ValueError(f"algo: {self.algo!r} given; accepted are {', '.join(sorted(ALGOS))}")
         for env_id in (self.env, *self.tests.also):
-            if env_id not in gym.registry:
-                gym.register_envs(importlib.import_module("gymnasium_robotics"))
-            if env_id not in gym.registry:
-                raise ValueError(f"env: {env_id!r} given; accepted is the id of a registered environment")
+            registered_id(env_id)
         try:
             check_hyperparameters(self.algo, list(self.hyperparams))
             if issubclass(ALGOS[self.algo], SavableAlgorithm):  # the zoo makes more of texts and lists
@@ -109,29 +112,77 @@ class Trial(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
                 raise ValueError(f"also: {env_id} given, whose observations or actions are not those of {self.env}")
 
 
-def hyperparameters(algo: str, env_id: str, conf_file: str | None, *overrides: dict[str, Any]) -> dict[str, Any]:
+def can_be_made(env_id: str, env_kwargs: dict[str, Any]) -> bool:
+    """
+    :param env_id: Id of an environment, perhaps with the module that registers it
+    :param env_kwargs: Arguments of ``gym.make``
+    :return: Whether this Python has what it needs
+    """
+    try:
+        registered_id(env_id)
+        _spaces_of(env_id, yaml.safe_dump(env_kwargs))
+    except ValueError:
+        return False
+    return True
+
+
+def hyperparameters(
+    algo: str, env_id: str, conf_file: str | None, *overrides: dict[str, Any], entry: str | None = None
+) -> dict[str, Any]:
     """
     :param algo: Name of the algorithm in the zoo
     :param env_id: Id of the environment
-    :param conf_file: A YAML file as the zoo's, or the name of one of ours; the algorithm's own when None
+    :param conf_file: A YAML file as the zoo's, or the name of one of ours; the algorithm's own when None. ``"constructor"``:
+        no file, what is not said is as the algorithm has it; ``"rl_zoo3"``: the RL zoo's own file of the algorithm
     :param overrides: What differs from its entry; of a group of settings only what is given, the last one holds
+    :param entry: In the RL zoo's file, the environment whose entry it is, if it is not this one: ``"Hopper-v4"``; of another
+        algorithm's file, ``"sac:FetchReach-v1"``, what this algorithm takes is added to its own ``default``
     :return: The settings
     :raises ValueError: If there is no such file or entry
     """
-    path = config_file(conf_file or settings_file(algo)) or Path(conf_file or algo)
-    if not path.is_file():
-        raise ValueError(f"conf-file: {conf_file!r} given for {algo!r}; accepted is a YAML file, or the name of one of ours")
-    entries = _entries(path, path.stat().st_mtime_ns)
-    if not isinstance(entries, dict) or not isinstance(entries.get(env_id), dict):
-        known = ", ".join(sorted(map(str, entries.keys() - {"default", "paper"}))) if isinstance(entries, dict) else "nothing"
-        raise ValueError(f"env: {env_id!r} given; {path.name} has settings for {known}")
     register()
+    if conf_file == "constructor":
+        settings = {}
+    elif conf_file == "rl_zoo3":
+        settings = _zoo_settings(algo, registered_id(env_id), entry)
+    else:
+        settings = _own_settings(algo, env_id, conf_file)
     algorithm: Any = ALGOS.get(algo)
-    settings = entries[env_id]
     for each in overrides:
         own = isinstance(algorithm, type) and issubclass(algorithm, SavableAlgorithm)
         settings = grouped(algorithm, settings, each) if own else {**settings, **each}
     return {name: _number(value) for name, value in settings.items()}
+
+
+def _zoo_settings(algo: str, env_id: str, entry: str | None) -> dict[str, Any]:
+    """The RL zoo's."""
+    other, _, name = (entry or env_id).rpartition(":")
+    files = {each: Path(rl_zoo3.__file__).parent / "hyperparams" / f"{each}.yml" for each in (algo, other or algo)}
+    for path in files.values():
+        if not path.is_file():
+            raise ValueError(f"conf-file: 'rl_zoo3' given for {path.stem!r}, for which the RL zoo has no settings")
+    own, others = (_entries(path, path.stat().st_mtime_ns) for path in (files[algo], files[other or algo]))
+    if name not in others and entry is not None:
+        raise ValueError(f"entry: {entry!r} given; {other or algo}.yml of the RL zoo has {', '.join(others)}")
+    if not other:
+        return dict(own.get(name, own["default"]))
+    taken = constructor_arguments(ALGOS[algo]) | ZOO_KEYS
+    return {**own["default"], **{key: value for key, value in others[name].items() if key in taken}}
+
+
+def _own_settings(algo: str, env_id: str, conf_file: str | None) -> dict[str, Any]:
+    """Of a file of ours, or one as the zoo's."""
+    path = config_file(conf_file or settings_file(algo)) or Path(conf_file or algo)
+    if not path.is_file():
+        raise ValueError(f"conf-file: {conf_file!r} given for {algo!r}; accepted is a YAML file, or the name of one of ours")
+    entries = _entries(path, path.stat().st_mtime_ns)
+    module, _, entry = env_id.rpartition(":")
+    if isinstance(entries, dict) and entry not in entries and (module or entry in gym.registry):
+        entry = "default"  # as in the zoo
+    if not isinstance(entries, dict) or not isinstance(entries.get(entry), dict):
+        known = ", ".join(sorted(map(str, entries.keys() - {"default", "paper"}))) if isinstance(entries, dict) else "nothing"
+        raise ValueError(f"env: {env_id!r} given; {path.name} has settings for {known}")
+    return dict(entries[entry])
 
 
 def setting_of(trial: Trial, name: str) -> Any:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-import msgspec
 import numpy as np
 import torch as th
 from torch import nn
@@ -13,33 +12,26 @@ from sb3_ddiffpg.buffers.mode_buffer import ModeReplayBuffer
 from sb3_ddiffpg.buffers.routes import ROUTE_SHARE
 from sb3_ddiffpg.buffers.trajectory import StepRecord, Trajectory
 from sb3_ddiffpg.clustering.paths import extent
+from sb3_ddiffpg.exploration.bonus_state import SavedEpisode, bonus_state
+from sb3_ddiffpg.exploration.cells import CellGrid
+from sb3_ddiffpg.exploration.episode_cells import EpisodeCells, numbers_of_cells
 from sb3_ddiffpg.exploration.known_regions import NO_ROUTE, KnownCells, KnownRoute, KnownRoutes, come_along
-from sb3_ddiffpg.exploration.novelty import NOVELTY_MEASURES, RunningMoments, VisitCounts, cell_entries, noveld_reward
+from sb3_ddiffpg.exploration.novelty import (
+    CellTable,
+    RunningMoments,
+    VisitCounts,
+    noveld_reward,
+)
+from sb3_ddiffpg.exploration.recount import count_again
 from sb3_ddiffpg.exploration.settings import ExplorationSettings, NoveltySettings
 from sb3_ddiffpg.exploration.visit_map import VisitMap
 from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
-from sb3_ddiffpg.serialization.safetensors_tree import check_array, convert
 from sb3_ddiffpg.utils.divergence import DivergenceWatch
 
 # Rows of which visits are taken back at a time
 _AT_A_TIME = 50_000
-
-
-class _Route(msgspec.Struct, forbid_unknown_fields=True):
-    number: int
-    paths: np.ndarray
-    radius: float
-
-
-class _Cells(msgspec.Struct, forbid_unknown_fields=True):
-    number: int
-    entries: np.ndarray
-
-
-class _State(msgspec.Struct, forbid_unknown_fields=True):
-    routes: list[_Route]
-    cells: list[_Cells]
-    visits: Any
+# Steps from which the cells' size is measured, at most
+_SAMPLE = 20_000
 
 
 class Notes(Protocol):
@@ -60,8 +52,9 @@ class ExplorationBonus:
     :param settings: What is new, and what it is worth
     :param exploration: What explorers are not paid for where there are modes; None: there are none
     :param n_envs: Number of environments
-    :param cell_size: Edge of the cells by which places are told apart, in the unit of the mode features
-    :param visit_map: Where visits are counted for pictures; None: nowhere
+    :param grid: Cells by which places are told apart
+    :param seen_cell: Edge of the cells of a map of visits, in the unit of the mode features; None: as those
+    :param build: Makes another measure, for another number of mode features; None: they will not change
     """
 
     def __init__(
@@ -71,17 +64,24 @@ class ExplorationBonus:
         settings: NoveltySettings,
         exploration: ExplorationSettings | None,
         n_envs: int,
-        cell_size: float,
-        visit_map: VisitMap | None = None,
+        grid: CellGrid,
+        seen_cell: float | None = None,
+        build: Callable[[int], nn.Module] | None = None,
     ) -> None:
         self.dim, self.settings, self.exploration = dim, settings, exploration
-        self.cell_size, self.visit_map = cell_size, visit_map
+        self.grid, self.seen_cell = grid, seen_cell
+        #: Visits for pictures; None where there are more than three mode features, and until cells have a size
+        self.visit_map: VisitMap | None = None
         self.novelty_model: Any = novelty_model
+        self._build: Any = build
         self.moments = RunningMoments(1, max_count=100_000)
-        self.known_cells = None if exploration is None else KnownCells(cell_size)
+        self.known_cells = None if exploration is None else KnownCells()
+        self._use_edges()
         self.routes = KnownRoutes(n_envs)
-        #: Cells that each running episode has seen
-        self._seen: list[set[int]] = [set() for _ in range(n_envs)]
+        self.episode_cells = EpisodeCells(n_envs)
+        #: Environments whose running episodes are so long that parts of them are stored, and may be gone
+        self._in_parts: set[int] = set()
+        self._of_file: list[SavedEpisode] = []
 
     def to(self, device: th.device) -> "ExplorationBonus":
         """
@@ -112,37 +112,96 @@ class ExplorationBonus:
             self.routes.observe(positions / record.scale)
         followed = notes.followed[rows] = self.routes.followed.copy()
         counts = notes.counted[rows] = followed == NO_ROUTE
-        notes.first_visits[rows] = self._first_visits(record) if self.settings.episodic else True
-        if counts.any():
+        known = self.grid.edges is not None  # else all is told again when they are, see ``review``
+        notes.first_visits[rows] = self.episode_cells.observe(record, self.grid) if self.settings.episodic and known else True
+        if counts.any() and (known or not isinstance(self.novelty_model, CellTable)):
             self.novelty_model.observe(th.as_tensor(positions[counts], device=self.device))
         if self.visit_map is not None:
             self.visit_map.observe(positions)
+        self._in_parts.update(env for env, _ in record.parts)
         for env, _ in record.finished:
             self._forget_episode(env)
 
-    def _first_visits(self, record: StepRecord) -> list[bool]:
-        n_started = len(record.started)
-        both = np.concatenate((record.start_positions, record.positions)) if n_started else record.positions
-        cells = self._cells(both)
-        for env, cell in zip(record.started.tolist(), cells[:n_started], strict=True):
-            self._seen[env].add(cell)
-        cells = cells[n_started:]
-        first = [cell not in seen for cell, seen in zip(cells, self._seen, strict=True)]
-        for cell, seen in zip(cells, self._seen, strict=True):
-            seen.add(cell)
-        return first
+    # ------------------------------------------------------------------ cells
 
-    def _cells(self, positions: np.ndarray) -> list[int]:
-        """The cell of each position, as a number."""
-        return cell_entries(th.from_numpy(positions), self.cell_size, 2**31).tolist() if len(positions) else []
+    @property
+    def n_cells(self) -> int:
+        """Number of places that are known; 0 where none are told apart."""
+        if self.visit_map is not None:
+            return len(self.visit_map)
+        return int(self.novelty_model.counts.count_nonzero()) if isinstance(self.novelty_model, VisitCounts) else 0
+
+    def restart(self, dim: int) -> None:
+        """
+        Places are told apart by other mode features from now on; what was new by the old ones says nothing.
+
+        :param dim: Number of mode features
+        """
+        self.dim, self.grid, self.seen_cell, self.visit_map = dim, CellGrid(dim), None, None
+        device = self.device
+        if not isinstance(self.novelty_model, VisitCounts):
+            self.novelty_model = self._build(dim)
+        self.known_cells = None if self.exploration is None else KnownCells()
+        self.routes.replace([])
+        self.to(device)
+
+    def _use_edges(self) -> None:
+        """The cells' size is known: tables and map are in it."""
+        edges = self.grid.edges
+        if edges is None:
+            return
+        for table in (self.novelty_model, self.known_cells):
+            if isinstance(table, CellTable):
+                table.use_edges(edges)
+        if self.visit_map is None and self.dim <= 3:
+            self.visit_map = VisitMap(self.dim, edges if self.seen_cell is None else self.seen_cell)
+
+    def review(self, buffer: ModeReplayBuffer, mastered: Mapping[int, int]) -> None:
+        """
+        Look whether the cells fit where the run has been; if they are others now, all visits are counted again.
+
+        :param buffer: Holds the steps
+        :param mastered: As for ``on_modes_changed``
+        """
+        rows = buffer.stored_rows.rows[: buffer.stored_rows.size]
+        sample = rows[:: len(rows) // _SAMPLE + 1]
+        before = self.grid.edges
+        if not self.grid.fit(buffer.positions(buffer.nexts, "next_observations", sample)) or before is self.grid.edges:
+            return
+        self.recount(buffer, mastered)
+
+    def _resize_tables(self, edges: np.ndarray) -> None:
+        for table in (self.novelty_model, self.known_cells):
+            if isinstance(table, CellTable):
+                table.resize(edges)
+        if self.visit_map is not None and len(self.visit_map) and self.seen_cell is None:
+            self.visit_map.resize(edges)
+
+    def recount(self, buffer: ModeReplayBuffer, mastered: Mapping[int, int]) -> None:
+        """
+        Places are told apart in another way now: count the visits of all stored steps again.
+
+        :param buffer: Holds the steps
+        :param mastered: As for ``on_modes_changed``
+        """
+        if self.grid.edges is None:
+            return
+        self._use_edges()
+        self._resize_tables(self.grid.edges)
+        counted = self.novelty_model if isinstance(self.novelty_model, VisitCounts) else None
+        unseen = self.visit_map if self.visit_map is not None and not len(self.visit_map) else None
+        count_again(buffer, self.grid, counted, unseen, first=self.settings.episodic)
+        self.recall_episodes(buffer)
+        self.on_modes_changed(buffer, mastered)
 
     def _forget_episode(self, env: int) -> None:
-        self._seen[env].clear()
+        self.episode_cells.seen[env].clear()
+        self._in_parts.discard(env)
         self.routes.forget(env)
 
     def forget_episodes(self) -> None:
         """The environments were reset outside: no episode is running."""
-        for env in range(len(self._seen)):
+        for env in range(self.routes.n_envs):
             self._forget_episode(env)
 
     def recall_episodes(self, buffer: ModeReplayBuffer) -> None:
@@ -152,12 +211,20 @@ class ExplorationBonus:
         :param buffer: Holds them
         """
         self.forget_episodes()
-        for env, seen in enumerate(self._seen):
+        lengths, known = buffer.running.lengths, buffer.success_rule.steps
+        episodes = [each for each in self._of_file if known[each.env] > lengths[each.env]]
+        self._of_file = []
+        for each in episodes:
+            self.episode_cells.seen[each.env].update(each.seen.tolist())
+            self._in_parts.add(each.env)
+            if len(each.been) == len(self.routes.routes):
+                self.routes.remember(each.env, each.been, each.followed)
+        for env, seen in enumerate(self.episode_cells.seen):
             rows = buffer.running.of(env)
-            if len(rows) and self.settings.episodic:
+            if len(rows) and self.settings.episodic and self.grid.edges is not None:
                 start = buffer.positions(buffer.steps, "observations", rows[:1])
                 reached = buffer.positions(buffer.nexts, "next_observations", rows)
-                seen.update(self._cells(np.concatenate((start, reached))))
+                seen.update(numbers_of_cells(np.concatenate((start, reached)), self.grid))
         self._recall_routes(buffer)
 
     def _recall_routes(self, buffer: ModeReplayBuffer) -> None:
@@ -298,7 +365,7 @@ class ExplorationBonus:
             elif mastered[mode] in before:
                 routes.append(before[mastered[mode]])
         unknown = [route for route in routes if route.number not in before]
-        self.routes.replace(routes)
+        self.routes.replace(routes, sorted(self._in_parts))
         noted = [np.empty(0, dtype=np.int32)]
         if unknown:
             # One that is a new route to a goal keeps its worth, however it began
@@ -333,66 +400,42 @@ class ExplorationBonus:
             "routes": [{"number": each.number, "paths": each.paths, "radius": each.radius} for each in self.routes.routes],
             "cells": [{"number": number, "entries": entries} for number, entries in cells.items()],
             "visits": None if self.visit_map is None else self.visit_map.state_dict(),
+            "edges": self.grid.edges if self.grid.adapts else None,
+            "episodes": [self._episode(env) for env in sorted(self._in_parts)],
+        }
+
+    def _episode(self, env: int) -> dict[str, Any]:
+        """Of which parts may be gone from the buffer: what it alone knows."""
+        been, followed = self.routes.memory(env)
+        return {
+            "env": env,
+            "seen": np.array(sorted(self.episode_cells.seen[env]), dtype=np.int64),
+            "been": been,
+            "followed": followed,
         }
 
     def acting_state(self) -> dict[str, Any]:
         """
         :return: The same without what only training needs
         """
-        return {**self.state_dict(), "routes": [], "cells": []}
+        return {**self.state_dict(), "routes": [], "cells": [], "episodes": []}
 
     def load_state_dict(self, tree: Any) -> None:
         """
         :param tree: What ``state_dict`` gave
         :raises ValueError: If it is something else
         """
-        state = convert(tree, _State, "bonus")
-        for each in state.routes:
-            check_array(each.paths, np.float32, [None, None, self.dim], "bonus.routes")
-            if not (
-                0 <= each.number < 2**31 and each.paths.size and np.isfinite(each.paths).all() and 0 <= each.radius < np.inf
-            ):
-                raise ValueError("bonus.routes: there is a route that cannot be")
-        for cells in state.cells:
-            check_array(cells.entries, np.int64, [None], "bonus.cells")
-            size = 0 if self.known_cells is None else len(self.known_cells.known)
-            if ((cells.entries < 0) | (cells.entries >= size)).any():
-                raise ValueError("bonus.cells: there is a cell that cannot be")
+        state = bonus_state(tree, self.dim, 0 if self.known_cells is None else len(self.known_cells.known))
+        self._of_file = [each for each in state.episodes or () if each.env < self.routes.n_envs]
+        found = None if state.visits is None else VisitMap.from_state(state.visits)
         self.routes.replace([KnownRoute(each.number, each.paths, each.radius) for each in state.routes])
         if self.known_cells is not None:
             self.known_cells.by_mode = {cells.number: cells.entries for cells in state.cells}
-        found = None if state.visits is None else VisitMap.from_state(state.visits)
+        if "edges" not in tree and self.grid.adapts:  # of a version that counted in cells of this size
+            self.grid = CellGrid(self.dim, VisitCounts.default_cell_size)
+            self._use_edges()
+        if state.edges is not None and len(state.edges) == self.dim:  # else of other mode features
+            self.grid.adapts, self.grid.edges = True, state.edges
+            self._use_edges()
         if found is not None and found.dim == self.dim:
             self.visit_map = found
-
-
-def make_bonus(
-    build: Callable[..., nn.Module],
-    settings: NoveltySettings,
-    exploration: ExplorationSettings | None,
-    dims: tuple[int, int],
-    n_envs: int,
-    counted_cell: float | None,
-    seen_cell: float,
-) -> ExplorationBonus:
-    """
-    :param build: Makes the measure of its class, its dimensions and its keyword arguments
-    :param settings: What is new, and what it is worth
-    :param exploration: See ``ExplorationBonus``
-    :param dims: Number of mode features, and of features of an observation
-    :param n_envs: Number of environments
-    :param counted_cell: Edge of the cells in which visits are counted, unless the settings say it; None: the measure's own
-    :param seen_cell: Of those in the map of visits, and of places where nothing is counted
-    :return: The bonus
-    :raises ValueError: If a cell has no size
-    """
-    arguments, measure = dict(settings.kwargs or {}), settings.measure
-    if measure == "counts":
-        # The environment says how far apart places are, unless the user does
-        arguments = {"cell_size": counted_cell or VisitCounts.default_cell_size, **arguments}
-    cell_size = arguments["cell_size"] if measure == "counts" else seen_cell
-    if not cell_size > 0:
-        raise ValueError(f"novelty.kwargs['cell_size'] must be positive, got {cell_size}")
-    novelty_model = build(NOVELTY_MEASURES[measure] if isinstance(measure, str) else measure, *dims, **arguments)
-    visit_map = VisitMap(dims[0], seen_cell) if dims[0] <= 3 else None
-    return ExplorationBonus(novelty_model, dims[0], settings, exploration, n_envs, float(cell_size), visit_map)

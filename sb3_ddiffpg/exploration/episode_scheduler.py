@@ -13,6 +13,11 @@ from sb3_ddiffpg.serialization.safetensors_tree import Count, check_array, conve
 
 #: In place of a row of the policy's embedding table: the zero embedding
 UNCONDITIONED = -1
+#: When nothing new has come until the run is so many times as long, exploration becomes less: it never ends, for what is left
+#: to be found is rarer than what was found before
+PATIENCE = 10
+# So many times as many places are news
+MORE_CELLS = 1.05
 
 
 class _State(msgspec.Struct, forbid_unknown_fields=True):
@@ -21,6 +26,8 @@ class _State(msgspec.Struct, forbid_unknown_fields=True):
     handed_over: np.ndarray
     may_hand_over: np.ndarray
     n_turns: Count
+    news_at: Count = 0
+    n_cells: Count = 0
 
 
 class EpisodeScheduler:
@@ -36,6 +43,8 @@ class EpisodeScheduler:
     def __init__(self, settings: ExplorationSettings, modes: Sized, n_envs: int = 0) -> None:
         self.settings, self.modes = settings, modes
         self.n_turns = 0
+        #: When something new came last, in environment steps of all training, and places that were known then
+        self.news_at = self.n_cells = 0
         self._forget(n_envs)
 
     def _forget(self, n_envs: int) -> None:
@@ -45,15 +54,32 @@ class EpisodeScheduler:
         self.handed_over = np.zeros(n_envs, dtype=bool)
         self.may_hand_over = np.zeros(n_envs, dtype=bool)
 
-    def exploration_share(self, progress_remaining: float) -> float:
+    def exploration_share(self, progress_remaining: float, step: int = 0) -> float:
         """
         :param progress_remaining: Of the training, from 1 to 0
+        :param step: Environment steps of all training so far
         :return: Share of the episodes that explore
         """
-        share = self.settings.share
-        if share is None:
-            return 1 / (len(self.modes) + 1) if 1 - progress_remaining < self.settings.fraction else 0.0
-        return float(FloatSchedule(share)(progress_remaining))
+        share, fraction = self.settings.share, self.settings.fraction
+        if share is not None:
+            return float(FloatSchedule(share)(progress_remaining))
+        if fraction is not None:
+            return 1 / (len(self.modes) + 1) if 1 - progress_remaining < fraction else 0.0
+        if not len(self.modes):  # also where no places are counted, which would be news
+            return 1.0
+        return min(1.0, PATIENCE * self.news_at / max(step, 1)) / (len(self.modes) + 1)
+
+    def note_news(self, step: int, n_cells: int, born: bool) -> None:
+        """
+        How long nothing new has come says how much is explored.
+
+        :param step: Environment steps of all training so far
+        :param n_cells: Number of places that are known by now
+        :param born: Whether a mode was born
+        """
+        if born or n_cells > MORE_CELLS * self.n_cells:
+            self.news_at, self.n_cells = step, n_cells
+        self.n_cells = min(self.n_cells, n_cells)  # cells have been joined
 
     def begin_all(self, n_envs: int, exploration_share: float) -> None:
         """

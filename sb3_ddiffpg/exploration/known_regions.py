@@ -105,13 +105,21 @@ class KnownRoutes:
         """
         return np.isin(numbers, self.numbers())
 
-    def replace(self, routes: Sequence[KnownRoute]) -> None:
+    def replace(self, routes: Sequence[KnownRoute], remembered: Sequence[int] = ()) -> None:
         """
         :param routes: The routes that are known from now on. Where the running episodes have been must be told again
+        :param remembered: Environments whose episodes cannot be told from their beginning: what they have been in of a route
+            that was known before, they have been in of what it is now
         """
+        kept = list(remembered)
+        before = dict(zip(self.numbers(), self._been[:, kept], strict=True))
+        followed = np.where(np.isin(self.followed[kept], [route.number for route in routes]), self.followed[kept], NO_ROUTE)
         self.routes = list(routes)
         self._been = np.zeros((len(routes), self.n_envs), dtype=np.int64)
+        for been, route in zip(self._been, routes, strict=True):
+            been[kept] = before.get(route.number, 0)
         self.followed = np.full(self.n_envs, NO_ROUTE, dtype=np.int32)
+        self.followed[kept] = followed
 
     def observe(self, positions: np.ndarray) -> None:
         """
@@ -123,14 +131,34 @@ class KnownRoutes:
 
     def replay(self, env: int, positions: np.ndarray) -> None:
         """
-        Follow a running episode from its beginning, as ``observe`` would have, step by step.
+        Follow a running episode as ``observe`` would have, step by step.
 
         :param env: Its environment
-        :param positions: All that it has reached, shape [length, dim]
+        :param positions: All that it has reached, but for what is remembered, shape [length, dim]
         """
         for been, route in zip(self._been, self.routes, strict=True):
-            been[env] = np.bitwise_or.reduce(route.parts(positions))
-        self.followed[env] = come_along(self.routes, positions)[-1]
+            been[env] |= np.bitwise_or.reduce(route.parts(positions))
+        if self.followed[env] == NO_ROUTE:
+            self.followed[env] = come_along(self.routes, positions)[-1]
+        gone = [route.number for been, route in zip(self._been, self.routes, strict=True) if route.is_gone(been[env])]
+        if self.followed[env] == NO_ROUTE and gone:
+            self.followed[env] = gone[0]
+
+    def remember(self, env: int, been: np.ndarray, followed: int) -> None:
+        """
+        :param env: Environment whose episode was saved
+        :param been: What ``memory`` gave of it
+        :param followed: And this
+        """
+        self._been[:, env] |= been
+        self.followed[env] = followed
+
+    def memory(self, env: int) -> tuple[np.ndarray, int]:
+        """
+        :param env: Environment
+        :return: Parts of each route in which its episode has been, as bits, shape [number of routes], and what it has followed
+        """
+        return self._been[:, env].copy(), int(self.followed[env])
 
     def forget(self, env: int) -> None:
         """
@@ -144,17 +172,26 @@ class KnownCells(CellTable):
     """
     The cells where modes go that know their route.
 
-    :param cell_size: Edge of a cell, in the unit of the positions
+    :param edge: Of a cell, in the unit of the positions, until ``resize`` says others
     """
 
     known: th.Tensor
 
-    def __init__(self, cell_size: float) -> None:
-        super().__init__(cell_size, "known", th.zeros(TABLE_SIZE, dtype=th.bool))
+    def __init__(self, edge: float = 1.0) -> None:
+        super().__init__(edge, "known", th.zeros(TABLE_SIZE, dtype=th.bool))
         #: Entries of the cells of each mode, by its number
         self.by_mode: dict[int, np.ndarray] = {}
         #: Whether any cell is known; asking the table would wait for the device
         self.any = False
+
+    def resize(self, edges: np.ndarray) -> None:
+        """
+        Forget all cells: they are others now.
+
+        :param edges: Of a cell along each component, in the unit of the positions, shape [dim]
+        """
+        super().resize(edges)
+        self.by_mode, self.any = {}, False
 
     def replace(self, positions: dict[int, th.Tensor | None]) -> None:
         """

@@ -150,17 +150,17 @@ class RandomNetworkDistillation(nn.Module):
         return loss.detach()
 
 
-def cell_entries(positions: th.Tensor, cell_size: float, table_size: int) -> th.Tensor:
+def cell_entries(positions: th.Tensor, edges: th.Tensor, table_size: int) -> th.Tensor:
     """
     Cells of a grid without bounds, hashed into a table of fixed size, so that the map's extent need not be known. The same
     cell has the same entry in every process.
 
     :param positions: Shape [N, dim]
-    :param cell_size: Edge of a cell, in their unit
+    :param edges: Of a cell along each component, in their unit, shape [dim] or [1]
     :param table_size: Number of entries of the table
     :return: Entry of each position's cell, shape [N]
     """
-    cells = (positions / cell_size).floor().long()
+    cells = (positions / edges).floor().long()
     mixed = (cells * _multipliers(positions.shape[1], positions.device)).sum(dim=-1)
     return (mixed ^ (mixed >> 21)) % table_size
 
@@ -180,18 +180,36 @@ class CellTable(nn.Module):
     """
     A value for every cell, see ``cell_entries``. It is as large as the one that is loaded into it.
 
-    :param cell_size: Edge of a cell, in the unit of the positions
+    :param edge: Of a cell, in the unit of the positions, until ``resize`` says others
     :param name: Of the values
     :param values: For all cells, shape [table_size]
     """
 
-    def __init__(self, cell_size: float, name: str, values: th.Tensor) -> None:
+    edges: th.Tensor
+
+    def __init__(self, edge: float, name: str, values: th.Tensor) -> None:
         super().__init__()
-        self.cell_size, self._name = cell_size, name
+        self._name = name
+        self.register_buffer("edges", th.tensor([edge], dtype=th.float32), persistent=False)
         self.register_buffer(name, values)
 
+    def resize(self, edges: np.ndarray) -> None:
+        """
+        Forget all cells: they are others now.
+
+        :param edges: Of a cell along each component, in the unit of the positions, shape [dim]
+        """
+        self.use_edges(edges)
+        getattr(self, self._name).zero_()
+
+    def use_edges(self, edges: np.ndarray) -> None:
+        """
+        :param edges: Of the cells that the table knows, shape [dim]
+        """
+        self.edges = th.as_tensor(edges, dtype=th.float32, device=self.edges.device)
+
     def _entries(self, positions: th.Tensor) -> th.Tensor:
-        return cell_entries(positions, self.cell_size, len(getattr(self, self._name)))
+        return cell_entries(positions, self.edges, len(getattr(self, self._name)))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         values, stored = getattr(self, self._name), state_dict.get(prefix + self._name)
@@ -207,7 +225,7 @@ class VisitCounts(CellTable):
 
     :param position_dim: Size of the position features
     :param observation_dim: Not used: counting needs few dimensions
-    :param cell_size: Edge of a cell, in the unit of the positions
+    :param cell_size: Edge of a cell, in the unit of the positions; the bonus says another where none is given
     :param table_size: Number of entries of the hash table
     """
 

@@ -9,6 +9,8 @@ from torch import nn
 from sb3_ddiffpg.exploration.novelty import NOVELTY_MEASURES
 from sb3_ddiffpg.utils.settings import FLAG, NOT_NEGATIVE, POSITIVE, SHARE, Accepted, Settings, at_least, setting
 
+#: Values of explorers are expected to be worth so many places that are worth most
+FIRST_PLACES = 5
 Schedule = Callable[[float], float]
 
 _MEASURE = Accepted(
@@ -61,9 +63,12 @@ class ExplorationSettings(Settings):
     """
     Who explores, and what explorers learn from.
 
-    :param share: Share of episodes that explore, a float or a function of the remaining progress. None: ``1 / (M + 1)`` until
-        ``fraction`` of the training, then 0; always 1 while there is no mode. While it is 0, no further mode is born
-    :param fraction: Part of the training that explores, when ``share`` is None
+    :param share: Share of episodes that explore, a float or a function of the remaining progress. None: ``1 / (M + 1)`` while
+        exploration brings something new, then less; always 1 while there is no mode. While it is 0, no further mode is born
+    :param fraction: Part of the training that explores, when ``share`` is None: of the ``horizon`` that ``learn`` was given,
+        or of each call of it. None: all of it, but less where nothing new has come for long: with ``t`` the run's steps when a
+        mode was born last, or another twentieth of all places was found, ``10 t / steps`` of that share, however many calls of
+        ``learn`` that takes
     :param hand_over: Share of the exploring episodes that go on with a mode or the zero embedding after a random time (on
         average the modes' mean length), so that they come to a goal by a route that no mode would have taken
     :param beyond_goals: Whether a goal does not end the exploratory critics' returns: it would be the one place that explorers
@@ -78,23 +83,36 @@ class ExplorationSettings(Settings):
         are in no mode, or in one that has not its fill of trajectories yet: a second route is worth finding where the first
         pays
     :param gamma: Discount factor of the exploratory critics; None: the modes'
-    :param n_steps: Length of the exploratory critics' multi-step returns (uncorrected)
-    :param v_max: Upper end of the support of the exploratory critics (the lower end is 0); None: what novelty can be worth at
-        most, ``novelty.clip * novelty.coef / (1 - gamma)``, or ``critic.v_max`` if that is more
+    :param n_steps: Length of the exploratory critics' multi-step returns (uncorrected); None: the algorithm's ``n_steps``, or
+        1 where that is None too
+    :param v_max: Upper end of the values that the exploratory critics represent (the lower end is 0); None: it follows what
+        they meet, up to what novelty can be worth at most, ``novelty.clip * novelty.coef / (1 - gamma)``; where ``critic`` has
+        a range, it is that, or ``critic.v_max`` if that is more
     """
 
     group = "exploration"
 
     share: float | Schedule | None = setting(None, SHARE.or_schedule().or_none(), flat="exploration_share")
-    fraction: float = setting(0.7, SHARE, flat="exploration_fraction")
+    fraction: float | None = setting(None, SHARE.or_none(), flat="exploration_fraction")
     hand_over: float = setting(0.5, SHARE, flat="explore_then_exploit")
     beyond_goals: bool = setting(True, FLAG, flat="explore_beyond_goals")
     off_modes: bool = setting(True, FLAG, flat="explore_off_modes")
     past_modes: bool = setting(True, FLAG, flat="explore_past_modes")
     new_route_coef: float = setting(0.0, NOT_NEGATIVE, flat="new_way_coef")
     gamma: float | None = setting(None, SHARE.or_none(), flat="exploration_gamma")
-    n_steps: int = setting(1, at_least(1), flat="exploration_n_steps")
+    n_steps: int | None = setting(None, at_least(1).or_none(), flat="exploration_n_steps")
     v_max: float | None = setting(None, POSITIVE.or_none(), flat="exploration_v_max")
+
+    def novelty_range(self, novelty: NoveltySettings, mode_gamma: float) -> tuple[float, float]:
+        """
+        :param novelty: What novelty is worth
+        :param mode_gamma: Discount factor of the modes' critics
+        :return: The upper end of the exploratory critics' values, where it follows what they meet: at first and at most
+        """
+        # A few places at their most; a new route to a goal is worth as much to an explorer
+        first = max(FIRST_PLACES * novelty.clip * novelty.coef, self.new_route_coef, 1e-6)
+        most = self.v_max_beside(novelty, first, mode_gamma)
+        return (first if self.v_max is None else most), most
 
     def gamma_beside(self, mode_gamma: float) -> float:
         """
@@ -103,13 +121,20 @@ class ExplorationSettings(Settings):
         """
         return mode_gamma if self.gamma is None else self.gamma
 
-    def v_max_beside(self, novelty: NoveltySettings, mode_v_max: float, mode_gamma: float) -> float:
+    def n_steps_beside(self, n_steps: int | None) -> int:
+        """
+        :param n_steps: Length of the returns of all critics, None if it was not given
+        :return: Of the exploratory ones
+        """
+        return self.n_steps or n_steps or 1
+
+    def v_max_beside(self, novelty: NoveltySettings, least: float, mode_gamma: float) -> float:
         """
         :param novelty: What novelty is worth
-        :param mode_v_max: Upper end of the support of the modes' critics
-        :param mode_gamma: Their discount factor
-        :return: Upper end of the support of the exploratory critics
+        :param least: The smallest that may be
+        :param mode_gamma: Discount factor of the modes' critics
+        :return: Upper end of the values of the exploratory critics
         """
         if self.v_max is not None:
             return self.v_max
-        return max(mode_v_max, novelty.clip * novelty.coef / max(1 - self.gamma_beside(mode_gamma), 1e-4))
+        return max(least, novelty.clip * novelty.coef / max(1 - self.gamma_beside(mode_gamma), 1e-4))

@@ -14,8 +14,9 @@ from sb3_ddiffpg.modes.mode import Mode, default_name
 from sb3_ddiffpg.serialization.safetensors_tree import check_array, convert
 
 #: What can happen to a mode; those of the second row by hand
+BIRTHS = ("born", "split from")
 EVENT_KINDS = (
-    *("born", "split from", "merged into", "retired"),
+    *(*BIRTHS, "merged into", "retired"),
     *("renamed to", "frozen", "released", "deleted"),
 )
 

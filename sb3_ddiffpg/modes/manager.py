@@ -43,6 +43,7 @@ class _State(msgspec.Struct, forbid_unknown_fields=True):
     modes: Any
     history: Any
     next_number: Count
+    success_is_told: bool = False
 
 
 class ModeManager:
@@ -59,6 +60,8 @@ class ModeManager:
         self.modes: list[Mode] = []
         self.history = ModeHistory()
         self.next_number = 0
+        #: Whether the environment itself has said what a success is
+        self.success_is_told = False
 
     def __len__(self) -> int:
         return len(self.modes)
@@ -96,7 +99,11 @@ class ModeManager:
         :param births: Whether modes may be born; the first always may
         :return: What happened: births, splits, merges and retirements
         """
+        self.success_is_told = buffer.has_success_signal
         retired = retired_modes(self.modes, self.settings.trials) if buffer.has_success_signal else []
+        # Those of successes that were none, unless the user keeps them
+        unfounded = {index for index in buffer.unfounded_modes if not self.modes[index].frozen}
+        buffer.unfounded_modes, retired = set(), sorted({*retired, *unfounded})
         readmit_homeless(buffer, {mode.number for index, mode in enumerate(self.modes) if index not in retired})
         found = find_modes(buffer, self.modes, self._cluster, self.settings, births, retired)
         # What was found is carried out: counters, off-mode successes, trajectories, networks, records
@@ -148,6 +155,17 @@ class ModeManager:
         numbers = range(self.next_number, self.next_number + n_modes)
         self.hold([Mode(number, default_name(number), born_at=step) for number in numbers], buffer, followers)
         buffer.expect_modes(n_modes)
+
+    def use_features(self, selection: Any, dim: int) -> None:
+        """
+        Modes differ in other features from now on. They stay who they are, by the trajectories that they have.
+
+        :param selection: See ``ModeFeatures``
+        :param dim: Number of components
+        """
+        self.mode_features = selection
+        for mode in self.modes:
+            mode.representative = np.empty((0, dim), dtype=np.float32)
 
     # ------------------------------------------------------------------ keeping
 
@@ -228,7 +246,12 @@ class ModeManager:
         """
         :return: All that is known of the modes, in plain values and arrays, for ``load_state_dict``
         """
-        return {"modes": modes_state(self.modes), "history": self.history.state_dict(), "next_number": self.next_number}
+        return {
+            "modes": modes_state(self.modes),
+            "history": self.history.state_dict(),
+            "next_number": self.next_number,
+            "success_is_told": self.success_is_told,
+        }
 
     def load_state_dict(self, state: Any) -> None:
         """
@@ -238,6 +261,6 @@ class ModeManager:
         known = convert(state, _State, "modes")
         self.modes = modes_from_state(known.modes)
         self.history = ModeHistory.from_state(known.history)
-        self.next_number = known.next_number
+        self.next_number, self.success_is_told = known.next_number, known.success_is_told
         if any(mode.number >= self.next_number for mode in self.modes):
             raise ValueError(f"modes: one has a number that is not below {self.next_number}, the next one's")

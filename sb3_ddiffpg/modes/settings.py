@@ -33,7 +33,8 @@ class ModeSettings(Settings):
     :param mask_prob: Probability p with which a mode's embedding is masked when the policy is trained
     :param backup_embedding: What the policy in a mode's Bellman target is conditioned on: ``"mode"``, its own embedding, or
         ``"masked"``, the same embedding masked as in the policy's training
-    :param n_steps: Length of the multi-step returns of the modes' critics (uncorrected)
+    :param n_steps: Length of the multi-step returns of the modes' critics (uncorrected); None: the algorithm's ``n_steps``,
+        or 5 where that is None too
     :param novelty_coef: Factor on the intrinsic reward that is added to the modes' rewards
     :param reset_new_critics: Whether the critics of a mode without parent start with a zeroed output layer, or are plain
         copies of the exploratory ones
@@ -52,7 +53,7 @@ class ModeSettings(Settings):
     embedding_dim: int = setting(5, at_least(1), flat="mode_embedding_dim")
     mask_prob: float = setting(0.5, SHARE, flat="mode_mask_prob")
     backup_embedding: str = setting("mode", one_of("mode", "masked"), flat="backup_embedding")
-    n_steps: int = setting(5, at_least(1), flat="mode_n_steps")
+    n_steps: int | None = setting(None, at_least(1).or_none(), flat="mode_n_steps")
     novelty_coef: float = setting(0.0, NOT_NEGATIVE, flat="mode_intrinsic_coef")
     reset_new_critics: bool = setting(True, FLAG, flat="reset_new_critics")
 
@@ -63,3 +64,10 @@ class ModeSettings(Settings):
                 f"modes.max_successes={self.max_successes} is less than min_size={self.min_size}: no more trajectories than "
                 "that would be remembered, and no mode ever be found"
             )
+
+    def n_steps_beside(self, n_steps: int | None) -> int:
+        """
+        :param n_steps: Length of the returns of all critics, None if it was not given
+        :return: Of the modes' critics
+        """
+        return self.n_steps or n_steps or 5

@@ -30,7 +30,7 @@ class ModeCritics(nn.Module):
 
     :param features_dim: Size F of the observation features
     :param action_dim: Size A of the action
-    :param net_arch: Sizes of the hidden layers
+    :param net_arch: Sizes of the hidden layers; without any the critics are linear
     :param n_groups: Number of groups G
     :param activation_fn: Activation of the hidden layers
     :param n_critics: Critics per group C; the minimum over them is used, as in TD3
@@ -59,8 +59,8 @@ class ModeCritics(nn.Module):
         twin_target: str = "lower_mean",
     ) -> None:
         super().__init__()
-        if not net_arch or min(net_arch) < 1:
-            raise ValueError(f"net_arch['qf'] must name at least one hidden layer, of at least one unit each, got {net_arch}")
+        if min(net_arch, default=1) < 1:
+            raise ValueError(f"net_arch['qf'] must name hidden layers of at least one unit each, got {net_arch}")
         self.n_critics, self.n_atoms, self.twin_target = n_critics, n_atoms, twin_target
         self.features_dim, self.action_dim = features_dim, action_dim
         self.activation = activation_fn()

@@ -78,7 +78,7 @@ class Denoiser(nn.Module):
     :param condition_dim: Size of the condition (observation features and mode embedding)
     :param action_dim: Size of the action
     :param n_steps: Number of diffusion steps T
-    :param net_arch: Sizes of the hidden layers
+    :param net_arch: Sizes of the hidden layers; without any the first layer is the last
     :param activation_fn: Activation of the hidden layers
     :param time_embedding_dim: Size of the step's embedding; its MLP has one hidden layer four times as wide
     """
@@ -93,9 +93,9 @@ class Denoiser(nn.Module):
         time_embedding_dim: int = 32,
     ) -> None:
         super().__init__()
-        if not net_arch or min(net_arch) < 1:
-            raise ValueError(f"net_arch['pi'] must name at least one hidden layer, of at least one unit each, got {net_arch}")
-        width = net_arch[0]
+        if min(net_arch, default=1) < 1:
+            raise ValueError(f"net_arch['pi'] must name hidden layers of at least one unit each, got {net_arch}")
+        width = net_arch[0] if net_arch else action_dim
         self.time_mlp = nn.Sequential(
             SinusoidalEmbedding(time_embedding_dim),
             nn.Linear(time_embedding_dim, 4 * time_embedding_dim),
@@ -109,10 +109,10 @@ class Denoiser(nn.Module):
         bound = 1 / math.sqrt(time_embedding_dim + condition_dim + action_dim)
         for part in (self.time_in, self.condition_in, self.action_in):
             nn.init.uniform_(part.weight, -bound, bound)
-        hidden: list[nn.Module] = [activation_fn()]
-        for size_in, size_out in pairwise(net_arch):
-            hidden += [nn.Linear(size_in, size_out), activation_fn()]
-        self.trunk = nn.Sequential(*hidden, nn.Linear(net_arch[-1], action_dim))
+        trunk: list[nn.Module] = []
+        for size_in, size_out in pairwise([*net_arch, action_dim]):
+            trunk += [activation_fn(), nn.Linear(size_in, size_out)]
+        self.trunk = nn.Sequential(*trunk)
         self.steps: th.Tensor
         self.register_buffer("steps", th.arange(n_steps), persistent=False)
 

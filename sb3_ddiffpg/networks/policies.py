@@ -2,31 +2,53 @@
 
 from collections.abc import Iterable, Sequence
 from itertools import chain
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, get_actor_critic_arch
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from sb3_ddiffpg.networks.critics import ModeCritics
-from sb3_ddiffpg.networks.extractors import default_extractor
+from sb3_ddiffpg.networks.extractors import adapt_extractors, default_extractor
 
 
 class SavablePolicy(BasePolicy):
     """
     A policy that is saved with what it was made of: what a subclass notes in ``_constructor``, and SB3's own arguments.
 
-    :param args: Of ``BasePolicy``
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param features_extractor_class: Features extractor; when None, that of ``default_features_extractor``
+    :param features_extractor_kwargs: Its keyword arguments
     :param kwargs: Of ``BasePolicy``
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, squash_output=True, **kwargs)
+    #: When None, observations are flattened, and those of a dict combined
+    default_features_extractor: ClassVar[type[BaseFeaturesExtractor] | None] = None
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        extractor = features_extractor_class or self.default_features_extractor
+        super().__init__(
+            observation_space,
+            action_space,
+            extractor or default_extractor(observation_space, features_extractor_kwargs),
+            features_extractor_kwargs,
+            squash_output=True,
+            **kwargs,
+        )
         self._constructor: dict[str, Any] = {}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -40,6 +62,14 @@ class SavablePolicy(BasePolicy):
             features_extractor_kwargs=self.features_extractor_kwargs,
         )
         return data
+
+    def adapt_inputs(self, obs: PyTorchObs) -> None:
+        """
+        Let what the networks see have mean 0 and one deviation, see ``StandardizedExtractor``.
+
+        :param obs: Observations from all over where the run has been, [N, ...]
+        """
+        adapt_extractors(self, preprocess_obs(obs, self.observation_space, self.normalize_images))
 
     def make_optimizer(self, parameters: Iterable[nn.Parameter], learning_rate: float) -> th.optim.Optimizer:
         """
@@ -165,7 +195,7 @@ class TwinCriticPolicy(SavablePolicy):
         super().__init__(
             observation_space,
             action_space,
-            features_extractor_class or default_extractor(observation_space, features_extractor_kwargs),
+            features_extractor_class,
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,

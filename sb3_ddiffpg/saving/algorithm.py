@@ -14,6 +14,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_get
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_ddiffpg.networks.extractors import unknown_to_0_1
 from sb3_ddiffpg.saving._legacy import parameters_of_0_1
 from sb3_ddiffpg.saving.checkpoint import InterruptedRun, read_checkpoint
 from sb3_ddiffpg.saving.model import KIND, ModelTree, build_model, model_tree
@@ -52,6 +53,8 @@ class SavableAlgorithm(OffPolicyAlgorithm):
     #: Networks of the policy that follow others slowly and only train: what they follow, by name
     target_networks: ClassVar[dict[str, str]] = {}
     _saves_to_act = False
+    #: Steps of the whole run, as ``learn`` was told; 0: of each call
+    horizon = 0
     #: While it is made of a file: the file's arrays, by part; None for one of one's own
     in_file: dict[str, dict[str, Any] | None] | None = None
     #: Of ``learn``, for callbacks: what they hold is given back however it ends
@@ -66,6 +69,10 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         "run_id": str,
         "_episode_num": Count,
         "_n_updates": Count,
+        "next_review": Count,
+        "horizon": Count,
+        "features_found": bool,
+        "features_settled": bool,
         "_current_progress_remaining": Annotated[float, Meta(ge=-(2.0**53), le=1.0)],
         "env_spec": str | None,
         "is_normalized": bool,
@@ -101,6 +108,8 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         return self
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        if self.horizon:
+            num_timesteps, total_timesteps = self.lifetime_steps, self.horizon
         super()._update_current_progress_remaining(num_timesteps, total_timesteps)
         # The last rollout may go beyond the end, where a schedule would give a learning rate below zero
         self._current_progress_remaining = max(0.0, self._current_progress_remaining)
@@ -262,7 +271,7 @@ def read_parameters(model: SavableAlgorithm, given: str | TensorDict, device: th
         _, parameters, _ = load_from_zip_file(parameters, device=device, load_data=False)
     parameters = parameters_of_0_1(parameters)
     policy = parameters.get("policy") or {}
-    own = model.policy.state_dict()
+    own = model.policy.state_dict().keys() - (unknown_to_0_1(model.policy).keys() - policy.keys())
     for target, online in model.target_networks.items():
         followed = [name for name in own if name.startswith(f"{online}.")]
         if set(followed) <= set(policy) and not any(name.startswith(f"{target}.") for name in policy):

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_no
 
 from sb3_ddiffpg.envs.snapshots import normalization, restore_normalization
 from sb3_ddiffpg.exploration.noise import check_noise
+from sb3_ddiffpg.networks.extractors import unknown_to_0_1
 from sb3_ddiffpg.saving._legacy import parameters_of_0_1
 from sb3_ddiffpg.saving.records import load_state_tree, state_tree
 from sb3_ddiffpg.serialization.codec import NeededError, from_plain, to_plain
@@ -171,6 +172,10 @@ def build_model(
         model.in_file = None
         if model.action_noise is not None:
             check_noise(model.action_noise, model.n_envs, int(np.prod(action_space.shape)))
+        raw = {name: value.cpu().numpy() for name, value in unknown_to_0_1(model.policy).items()}
+        policy = saved.parameters.get("policy", {})
+        if not raw.keys() & policy.keys():
+            saved.parameters["policy"] = {**raw, **policy}
         parameters = fitting_parameters(model, saved.parameters)
         model.set_parameters(parameters, exact_match=True, device=model.device)
     except (TypeError, AttributeError, AssertionError, LookupError, RuntimeError, ArithmeticError, MemoryError) as error:
@@ -268,8 +273,10 @@ def sized_as(expected: dict[str, Any], part: str, make: Callable[..., Built], *a
     :raises ValueError: If the file has other arrays
     """
     with th.device("meta"), preserved_rng():
-        needed = {name: list(value.shape) for name, value in make(*args, **kwargs).state_dict().items()}
+        sketch: Any = make(*args, **kwargs)
     there = {name: list(np.shape(value)) for name, value in expected.items()}
+    filled = unknown_to_0_1(sketch).keys() - there.keys()
+    needed = {name: list(value.shape) for name, value in sketch.state_dict().items() if name not in filled}
     if needed != there:
         different = next(name for name in sorted(needed.keys() | there.keys()) if needed.get(name) != there.get(name))
         raise ValueError(

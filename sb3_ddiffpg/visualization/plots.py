@@ -202,10 +202,12 @@ def draw_visits(axes: Any, visits: VisitMap, maze: Any = None, most: float | Non
     """
     most = usual_visits(visits) if most is None else most
     centres, counts = visits.cells()
-    columns = np.round(_in_plane(centres) / visits.cell_size - 0.5).astype(int)
+    cell = _in_plane(visits.cell_size[None])[0]
+    cell = np.where((cell > 0) & np.isfinite(cell), cell, 1.0)
+    columns = np.floor(_in_plane(centres) / cell).astype(int)
     coarse = int(np.ptp(columns, axis=0).max()) // 1000 + 1  # a stray far away must not make a picture of a million cells
     columns //= coarse
-    edge = coarse * visits.cell_size
+    edge = coarse * cell
     low = columns.min(axis=0)
     density = np.zeros(columns.max(axis=0) - low + 1)
     np.add.at(density, tuple((columns - low).T), counts)
@@ -237,7 +239,8 @@ def plot_exploration(visits: VisitMap | None, maze: Any = None) -> Figure:
     figure.colorbar(image, ax=left, label=f"visits (from {usual_visits(visits):,.0f} on alike)", extend="max")
     right.plot(*np.array(visits.coverage or [(0, 0)]).T)
     _count_steps(right)
-    right.set(ylabel=f"known cells of {visits.cell_size:g} m", ylim=(0, None))
+    edges = " x ".join(f"{edge:.3g}" for edge in visits.cell_size if np.isfinite(edge))
+    right.set(ylabel=f"known cells of {edges}", ylim=(0, None))
     return figure
 
 

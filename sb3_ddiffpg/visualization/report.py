@@ -4,107 +4,26 @@ import base64
 import inspect
 import io
 import re
-from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-import gymnasium as gym
 import imageio.v3 as imageio
 import jinja2
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from matplotlib.colors import to_hex
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
-from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.evaluation.evaluate import evaluate_modes
 from sb3_ddiffpg.evaluation.results import ModeEvaluation
+from sb3_ddiffpg.evaluation.task import Task
 from sb3_ddiffpg.utils.arguments import groups_of, settings_attribute
+from sb3_ddiffpg.utils.vec_envs import env_attribute
 from sb3_ddiffpg.utils.versions import versions
 from sb3_ddiffpg.visualization import figures, plots
 
 # Of an evaluation's episodes, so many are drawn for each mode
 _ROUTES_DRAWN = 20
-
-
-def _remembered(env_spec: str) -> tuple[str, dict[str, Any]]:
-    """Id and arguments of the environment of a model, which may be a stranger's: no module is imported on its behalf."""
-    try:
-        spec = EnvSpec.from_json(env_spec)
-        kwargs = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
-        if spec.id not in gym.registry:
-            raise ValueError(f"{spec.id!r} is not registered")
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, AssertionError, gym.error.Error) as error:
-        raise ValueError(f"--env: not given, and what the model remembers is no environment here: {error!r}") from None
-    return spec.id, {name: value for name, value in kwargs.items() if name != "render_mode" and value is not None}
-
-
-@dataclass(frozen=True)
-class Task:
-    """
-    The environment in which a model is shown.
-
-    :param id: Of the environment
-    :param kwargs: Arguments of ``gym.make``
-    :param statistics: A ``VecNormalize`` that was saved, if the model was trained on normalised observations
-    """
-
-    id: str
-    kwargs: dict[str, Any]
-    statistics: Path | None = None
-
-    @staticmethod
-    def of(model: Any, env_id: str | None = None, env_kwargs: dict[str, Any] | None = None) -> "Task":
-        """
-        :param model: A trained model, which remembers where
-        :param env_id: Of another environment; where the model was trained when None
-        :param env_kwargs: Further arguments of ``gym.make``
-        :return: The task, from one fixed start if it is one of this package
-        :raises ValueError: If there is no such environment, or nobody knows which
-        """
-        kwargs: dict[str, Any] = {}
-        if env_id is None:
-            if model.env_spec is None:
-                raise ValueError("--env: not given, and the model does not remember the environment in which it was trained")
-            env_id, kwargs = _remembered(model.env_spec)
-        if env_id not in gym.registry:
-            raise ValueError(f"--env: {env_id!r} is not registered")
-        if is_ours(env_id):
-            kwargs["start_noise"] = 0.0
-        return Task(env_id, {**kwargs, **(env_kwargs or {})})
-
-    def make(self, n_envs: int, seed: int, **kwargs: Any) -> VecEnv:
-        """
-        :param n_envs: Number of environments
-        :param seed: Of the first
-        :param kwargs: Further arguments of ``gym.make``
-        :return: The environments
-        """
-        env = make_vec_env(self.id, n_envs, seed=seed, **{**self.kwargs, **kwargs})
-        if self.statistics is None:
-            return env
-        normalizer = VecNormalize.load(str(self.statistics), env)
-        normalizer.training = normalizer.norm_reward = False
-        return normalizer
-
-    def check(self, model: Any) -> None:
-        """
-        :param model: That is to be shown in it
-        :raises ValueError: If it cannot be
-        """
-        if model.is_normalized and self.statistics is None:
-            raise ValueError("--vec-normalize: not given, but the model was trained on normalised observations")
-        try:
-            env = self.make(1, 0)
-        except (gym.error.Error, TypeError, ValueError) as error:
-            raise ValueError(f"--env: {self.id} cannot be made with {self.kwargs}: {error}") from error
-        ours, theirs = (model.observation_space, model.action_space), (env.observation_space, env.action_space)
-        env.close()
-        if ours != theirs:
-            raise ValueError(
-                f"--env: {self.id} has observations and actions {theirs}, the model was trained on {ours}; a wrapper "
-                "that changes them must be part of a registered environment"
-            )
 
 
 def film(model: Any, task: Task, mode: str | None, seed: int, max_frames: int = 400) -> tuple[np.ndarray, int]:
@@ -165,7 +84,7 @@ def make_report(
     env = task.make(min(n_episodes, 25), seed)
     found = evaluate_modes(model, env, n_episodes, seed=seed)
     first: Any = env.reset()
-    maze = env.get_attr("maze", indices=0)[0] if env.has_attr("maze") else None
+    maze = env_attribute(env, "maze")
     normalizer = unwrap_vec_normalize(env)
     original: Any = first if normalizer is None else normalizer.get_original_obs()
     observation = None if isinstance(original, dict) else original[0]
@@ -201,14 +120,17 @@ def make_report(
 def _films(model: Any, task: Task, seed: int, output: Path) -> tuple[list[dict[str, str]], str]:
     """A film of each mode, beside the page and for it; or why there is none."""
     films = []
-    for index, name in enumerate(model.modes.names):
-        path = output.with_name(f"{output.stem}-{index}-{re.sub(r'[^-a-zA-Z0-9_.]', '_', name)}.mp4")
-        try:
-            frames, rate = film(model, task, name, seed)
-        except Exception as error:  # whatever an environment's drawing raises: a page without films is better than none
-            return [], f"No film could be made: {error}"
-        imageio.imwrite(path, frames, fps=rate, macro_block_size=2)
-        films.append({"name": name, "data": base64.b64encode(path.read_bytes()).decode()})
+    with TemporaryDirectory(dir=output.parent) as folder:
+        for index, name in enumerate(model.modes.names):
+            path = Path(folder, f"{output.stem}-{index}-{re.sub(r'[^-a-zA-Z0-9_.]', '_', name)}.mp4")
+            try:
+                frames, rate = film(model, task, name, seed)
+            except Exception as error:  # whatever an environment's drawing raises: a page without films is better than none
+                return [], f"No film could be made: {error}"
+            imageio.imwrite(path, frames, fps=rate, macro_block_size=2)
+            films.append({"name": name, "data": base64.b64encode(path.read_bytes()).decode()})
+        for path in Path(folder).iterdir():
+            path.replace(output.with_name(path.name))
     return films, ""
 
 

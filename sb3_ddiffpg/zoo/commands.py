@@ -1,4 +1,4 @@
-"""The zoo's scripts as commands of this package: train, enjoy, record_video."""
+"""The zoo's scripts as commands of this package: train, enjoy, record_video. Beside them check."""
 
 import argparse
 import importlib.util
@@ -17,11 +17,15 @@ import rl_zoo3.enjoy
 import rl_zoo3.train
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.vec_env import DummyVecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_ddiffpg.baselines import BASELINES
+from sb3_ddiffpg.buffers.success import GoalWatch
+from sb3_ddiffpg.check.command import main as check
 from sb3_ddiffpg.ddiffpg.ddiffpg import DDiffPG
+from sb3_ddiffpg.envs import import_packages, registered_id
 from sb3_ddiffpg.saving.checkpoint import checkpoint_files
+from sb3_ddiffpg.utils.vec_envs import labels_routes
 from sb3_ddiffpg.zoo.manager import ModeExperimentManager
 from sb3_ddiffpg.zoo.registration import register
 from sb3_ddiffpg.zoo.settings import ALGO, ALGOS, check_config_file, config_file
@@ -32,7 +36,7 @@ CHECKPOINT_FREQ = 100_000
 
 class OutcomeVecEnv(DummyVecEnv):
     """
-    Counts how the episodes ended, by the ground-truth label in ``info["mode"]``.
+    Counts how the episodes ended, by the ground-truth label in ``info["mode"]``, where the environments declare one.
 
     :param env_fns: Functions that make the environments
     :param outcomes: Label -> [episodes, successes]; counted up in place
@@ -40,16 +44,22 @@ class OutcomeVecEnv(DummyVecEnv):
 
     def __init__(self, env_fns: list[Callable[[], gym.Env]], outcomes: dict[str, list[int]]) -> None:
         super().__init__(env_fns)
-        self.outcomes = outcomes
+        self.outcomes, self.watch = outcomes, GoalWatch(len(env_fns), labelled=labels_routes(self))
+
+    def reset(self) -> VecEnvObs:
+        self.watch = GoalWatch(self.num_envs, labelled=self.watch.labelled)
+        return super().reset()
 
     def step_wait(self) -> VecEnvStepReturn:
         observations, rewards, dones, infos = super().step_wait()
-        for index in np.flatnonzero(dones):
-            if "mode" in infos[index]:
-                label = infos[index]["mode"]
-                outcome = self.outcomes["(no goal)" if label is None else str(label)]
+        self.watch.observe(infos)
+        for index in np.flatnonzero(dones).tolist():
+            if self.watch.labelled:
+                label = self.watch.so_far(index, infos[index]).label
+                outcome = self.outcomes["(no goal)" if label is None else label]
                 outcome[0] += 1
-                outcome[1] += bool(infos[index].get("is_success", False))
+                outcome[1] += bool(self.watch.so_far(index, infos[index]).success)
+            self.watch.end(index)
         return observations, rewards, dones, infos
 
 
@@ -159,7 +169,12 @@ def record_video(arguments: Sequence[str]) -> None:
     _play(partial(runpy.run_module, "rl_zoo3.record_video", run_name="__main__"), arguments)
 
 
-COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {"train": train, "enjoy": enjoy, "record_video": record_video}
+COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
+    "check": check,
+    "train": train,
+    "enjoy": enjoy,
+    "record_video": record_video,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -169,7 +184,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="ddiffpg",
         description="DDiffPG in the RL zoo.",
-        epilog="`ddiffpg COMMAND -h` lists the zoo's options. Beside them: train --n-envs N, "
+        epilog="check ENV says what DDiffPG makes of an environment. `ddiffpg COMMAND -h` lists the options, also the zoo's. "
+        "Beside them: train --n-envs N, "
         "--checkpoint-freq STEPS, --resume [FOLDER]; enjoy and record_video --mode M.",
     )
     parser.add_argument("command", choices=list(COMMANDS))
@@ -182,6 +198,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--algo", default=ALGO)
     parser.add_argument("--env")
+    parser.add_argument("--gym-packages", nargs="+", default=[])
     return parser
 
 
@@ -189,10 +206,13 @@ def _read(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> tuple[ar
     """Take out what ``parser`` knows, and see to it that the zoo will know the algorithm and the environment."""
     register()
     known, rest = parser.parse_known_args(arguments)
-    if known.env is not None:
-        rest += ["--env", known.env]
-        if known.env not in gym.registry:
-            gym.register_envs(importlib.import_module("gymnasium_robotics"))
+    try:
+        import_packages(known.gym_packages)
+        if known.env is not None:
+            known.env = registered_id(known.env)
+            rest += ["--env", known.env]
+    except ValueError as error:
+        raise SystemExit(str(error)) from None
     return known, [*rest, "--algo", known.algo]
 
 

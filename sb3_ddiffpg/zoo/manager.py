@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from sb3_ddiffpg.callbacks.checkpoint import RunCheckpointCallback
 from sb3_ddiffpg.common.schedules import LateLinearSchedule
 from sb3_ddiffpg.envs import is_ours, make_vec_env
+from sb3_ddiffpg.envs.description import wrappers_said
 from sb3_ddiffpg.envs.vec_env.tracing import TracingDummyVecEnv
 from sb3_ddiffpg.envs.vec_env.workers import WorkerVecEnv
 from sb3_ddiffpg.saving.algorithm import SavableAlgorithm
@@ -25,10 +26,14 @@ from sb3_ddiffpg.zoo.settings import ALGOS, check_hyperparameters
 SCHEDULES: dict[str, Callable[[float], Any]] = {"": float, "lin": SimpleLinearSchedule, "late": LateLinearSchedule}
 
 
-def _spared(wrapper: Callable[[Any], Any] | None, env: Any) -> Any:
-    """The zoo's wrapper around SB3's monitor, which a full disk does not end."""
+def _spared(wrapper: Callable[[Any], Any] | None, said: list[dict[str, Any]], env: Any) -> Any:
+    """The zoo's wrapper around SB3's monitor, which a full disk does not end. It says of which wrappers it was made."""
     spared_monitor(env)
-    return env if wrapper is None else wrapper(env)
+    if wrapper is None:
+        return env
+    wrapped = wrapper(env)
+    wrapped.wrappers_said = said
+    return wrapped
 
 
 class ModeExperimentManager(ExperimentManager):
@@ -40,6 +45,7 @@ class ModeExperimentManager(ExperimentManager):
     def __init__(self, *args: Any, checkpoint_freq: int = 0, resume: Path | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.checkpoint_freq, self.resume = checkpoint_freq, resume
+        self.wrappers_said: list[dict[str, Any]] = []
         self.is_own = issubclass(ALGOS[self.algo], SavableAlgorithm)
         if self.is_own:
             self.deterministic_eval = False
@@ -55,6 +61,7 @@ class ModeExperimentManager(ExperimentManager):
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         check_hyperparameters(self.algo, list(hyperparams))
+        self.wrappers_said = wrappers_said(hyperparams.get("env_wrapper"))
         return super()._preprocess_hyperparams(hyperparams)
 
     @staticmethod
@@ -104,7 +111,7 @@ class ModeExperimentManager(ExperimentManager):
         wrapped = self.env_wrapper is not None or self.frame_stack is not None
         if not is_ours(env_id) or wrapped or self.vec_env_class is WorkerVecEnv:
             wrapper = self.env_wrapper
-            self.env_wrapper = partial(_spared, wrapper)
+            self.env_wrapper = partial(_spared, wrapper, self.wrappers_said)
             try:
                 return super().create_envs(n_envs, eval_env, no_log)
             finally:
@@ -113,7 +120,7 @@ class ModeExperimentManager(ExperimentManager):
         # A run that goes on must not lose what it has noted
         n_before = len(list(Path(self.save_path).glob("*.monitor.csv")))
         monitor_file = None if eval_env or no_log else os.path.join(self.save_path, str(n_before))
-        env = make_vec_env(env_id, n_envs, seed=self.seed, **env_kwargs)
+        env = make_vec_env(env_id, n_envs, seed=self.seed, env_kwargs=env_kwargs)
         if isinstance(env, VecMonitor):  # it writes no file
             env = env.venv
         env = spared_monitor(VecMonitor(env, monitor_file, **{"info_keywords": ("is_success",), **self.monitor_kwargs}))

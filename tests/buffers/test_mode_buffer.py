@@ -17,10 +17,11 @@ from sb3_ddiffpg.buffers.mode_buffer import ModeReplayBuffer
 from sb3_ddiffpg.buffers.state import buffer_state, restore_buffer
 from sb3_ddiffpg.buffers.storage import RowSet
 from sb3_ddiffpg.buffers.success import SuccessRule
-from sb3_ddiffpg.buffers.trajectory import NO_MODE
+from sb3_ddiffpg.buffers.trajectory import NO_MODE, PAST_GOAL
 from sb3_ddiffpg.clustering.distance_cache import DistanceCache
 from sb3_ddiffpg.clustering.dtw import dtw_distances
 from sb3_ddiffpg.exploration.bonus import ExplorationBonus
+from sb3_ddiffpg.exploration.cells import CellGrid
 from sb3_ddiffpg.exploration.novelty import VisitCounts
 from sb3_ddiffpg.exploration.settings import NoveltySettings
 
@@ -57,9 +58,11 @@ class PlainBuffer:
             return [min(retired, key=lambda episode: episode["retired"])]
         groups = defaultdict(list)
         for episode in self.episodes:
-            groups[episode["mode"], episode["success"] and not episode["off_mode"]].append(episode)
+            groups[PAST_GOAL if episode["past"] else episode["mode"], episode["success"] and not episode["off_mode"]].append(
+                episode
+            )
         # A mode's only success stays
-        groups = [group for key, group in groups.items() if len(group) > 1 or key[0] == NO_MODE or not key[1]]
+        groups = [group for key, group in groups.items() if len(group) > 1 or key[0] < 0 or not key[1]]
         largest = max((sum(len(e["steps"]) for e in group) for group in groups), default=0)
         oldest = [min(group, key=lambda e: e["serial"]) for group in groups]
         return [e for e, group in zip(oldest, groups, strict=True) if sum(len(g["steps"]) for g in group) == largest]
@@ -77,26 +80,36 @@ class PlainBuffer:
         return False
 
     def add(self, env, step, done, success):
+        """An episode is what it does up to its first success; the rest is stored by itself."""
+        step["before"] = len(self.running[env])
+        step["goal"] = success and not any(earlier["goal"] for earlier in self.running[env])
         self.running[env].append(step)
         if done:
-            episode = {"steps": self.running[env], "success": success, "serial": self.n_finished}
-            self.episodes.append(episode | {"mode": NO_MODE, "trains": False, "off_mode": False, "retired": None})
-            self.n_finished += 1
-            self.running[env] = []
+            steps, self.running[env] = self.running[env], []
+            end = next((i + 1 for i, each in enumerate(steps) if each["goal"]), len(steps))
+            for part, past in ((steps[:end], False), (steps[end:], True)):
+                if part:
+                    episode = {"steps": part, "success": part[-1]["goal"], "serial": self.n_finished, "past": past}
+                    episode["return"] = sum(each["reward"] for each in (part if past else steps))
+                    self.episodes.append(episode | {"mode": NO_MODE, "trains": False, "off_mode": False, "retired": None})
+                    self.n_finished += 1
 
     def cells_seen(self, env, obs):
         """Of an episode that goes on from an observation: where it began, and what it has reached."""
         before = self.running[env]
         return [cell(before[0]["obs"] if before else obs), *(cell(step["next_obs"]) for step in before)]
 
-    def length_before(self, env, number):
+    def length_before(self, number):
         """Steps of an episode before one, which may have ended it."""
-        episodes = [self.running[env], *(e["steps"] for e in self.episodes)]
-        return next(len(e) - 1 for e in episodes if e and e[-1]["number"] == number)
+        return next(step["before"] for step in self.steps() if step["number"] == number)
 
     def active(self, success):
         """Those in use by a mode or not yet clustered, in order of finishing; off-mode successes count as failures."""
-        found = [e for e in self.episodes if (e["success"] and not e["off_mode"]) == success and e["retired"] is None]
+        found = [
+            e
+            for e in self.episodes
+            if (e["success"] and not e["off_mode"]) == success and e["retired"] is None and not e["past"]
+        ]
         return sorted(found, key=lambda episode: episode["serial"])
 
     def assign(self, success_modes, failure_modes, parents):
@@ -131,7 +144,8 @@ class PlainBuffer:
     def window(self, number, n_steps, for_mode, gamma=GAMMA):
         """
         n-step reward, discount and the last step of the window that begins with a step. For a mode, a step off its route is
-        the end, without reward; for exploration a goal is none if it shall go on beyond.
+        the end, without reward, and a goal the end too, at which one stays for ever where the environment does not end the
+        episode and pays; for exploration a goal that ends it is none if it shall go on beyond.
         """
         episodes = [e["steps"] for e in self.episodes] + self.running
         steps = next(e for e in episodes if any(step["number"] == number for step in e))
@@ -139,9 +153,14 @@ class PlainBuffer:
         reward, discount, lost = 0.0, 1.0, False
         for last in steps[first : first + n_steps]:
             lost = lost or (for_mode and last["off_route"])
-            reward += 0.0 if lost else discount * last["reward"]
+            terminated, goal = (
+                last["done"] and not last["timeout"],
+                last["goal"] and all(steps is not each for each in self.running),
+            )
+            stays = for_mode and goal and not terminated and last["reward"] > 0
+            reward += 0.0 if lost else discount * last["reward"] * (sum(gamma**k for k in range(1000)) if stays else 1)
             discount *= gamma
-        ended = last["done"] and not last["timeout"] and not (last["goal"] and self.explore_beyond_goals and not for_mode)
+        ended = terminated or goal if for_mode else terminated and not (goal and self.explore_beyond_goals)
         return reward, 0.0 if lost or ended else discount, last
 
 
@@ -157,7 +176,7 @@ class BufferMachine(RuleBasedStateMachine):
         size = self.longest * (n_envs + self.most_modes) + spare
         limits = {"max_successes_per_mode": 4, "max_failures_per_mode": 2}
         self.buffer = make_buffer(size, n_envs, **limits, explore_beyond_goals=beyond)
-        self.bonus = ExplorationBonus(VisitCounts(2, 2), 2, NoveltySettings(), None, n_envs, cell_size=1.0)
+        self.bonus = ExplorationBonus(VisitCounts(2, 2), 2, NoveltySettings(), None, n_envs, CellGrid(2, 1.0))
         self.plain = PlainBuffer(size, n_envs, 4, 2, beyond)
 
     def stored(self):
@@ -180,7 +199,7 @@ class BufferMachine(RuleBasedStateMachine):
         full_length = np.array([len(episode) == self.longest - 1 for episode in self.plain.running])
         dones = full_length | (self.rng.random(self.n_envs) < 0.3)
         timeouts = dones & (self.rng.random(self.n_envs) < 0.5)
-        successes = dones & (self.rng.random(self.n_envs) < 0.6)
+        successes = self.rng.random(self.n_envs) < np.where(dones, 0.6, 0.1)
         infos = [
             {"is_success": bool(success), "TimeLimit.truncated": bool(timeout)}
             for success, timeout in zip(successes, timeouts, strict=True)
@@ -199,15 +218,15 @@ class BufferMachine(RuleBasedStateMachine):
                 "reward": float(rewards[env]),
                 "done": bool(dones[env]),
                 "timeout": bool(timeouts[env]),
-                "goal": bool(successes[env]),
                 "off_route": False,
                 "first": cell(next_obs[env]) not in self.plain.cells_seen(env, obs[env]),
             }
             self.plain.add(env, step, dones[env], bool(successes[env]))
         assert [env for env, _ in record.finished] == np.flatnonzero(dones).tolist()
-        assert [t.success for _, t in record.finished] == successes[dones].tolist()
+        outcomes = {e["serial"]: e["success"] for e in self.plain.episodes}
+        assert all(t.success == outcomes.get(t.serial, t.success) for _, t in record.finished)
         np.testing.assert_array_equal(record.positions, next_obs)
-        starts = [env for env in range(self.n_envs) if self.plain.length_before(env, numbers[env]) == 0]
+        starts = [env for env in range(self.n_envs) if self.plain.length_before(numbers[env]) == 0]
         assert record.started.tolist() == starts
         np.testing.assert_array_equal(record.start_positions, obs[starts])
 
@@ -332,7 +351,7 @@ class BufferMachine(RuleBasedStateMachine):
             assert [t.trains for t in trajectories] == [e["trains"] for e in active]
             for trajectory, episode in zip(trajectories, active, strict=True):
                 assert trajectory.rows.tolist() == [stored[step["number"]] for step in episode["steps"]]
-                assert trajectory.episode_return == pytest.approx(sum(step["reward"] for step in episode["steps"]), abs=1e-4)
+                assert trajectory.episode_return == pytest.approx(episode["return"], abs=1e-4)
                 last = episode["steps"][-1]["next_obs"]
                 path = [*(step["obs"] for step in episode["steps"]), last]
                 np.testing.assert_array_equal(self.buffer.full_path(trajectory), np.stack(path))
@@ -614,18 +633,15 @@ def test_intrinsic_rewards_end_where_the_route_does():
     np.testing.assert_array_equal(lengths[1], np.array([3, 3, 2, 1, 0, 0, 2, 1])[step[1]])
 
 
-def test_full_of_unfinished_episodes_is_a_clear_error_that_loses_nothing():
+def test_full_of_the_modes_last_successes_is_a_clear_error_that_loses_nothing():
     buffer = make_buffer(buffer_size=30, mode_features=[0, 1])
-    fill(buffer, [np.zeros((11, 2), dtype=np.float32)])
-    buffer.assign_modes(buffer.trajectories(True), np.zeros(1), [], np.zeros(0), [None])
+    fill(buffer, [np.zeros((16, 2), dtype=np.float32)] * 2)
+    buffer.assign_modes(buffer.trajectories(True), np.arange(2), [], np.zeros(0), [None] * 2)
     obs = np.ones((1, 2), dtype=np.float32)
     with pytest.raises(ValueError, match="buffer_size=30 transitions is too small.*1 environment"):
-        for _ in range(40):
-            buffer.add(obs, obs, obs, np.zeros(1), np.array([False]), [{}])
-    # The mode's only success and all of the running episode are still there
-    assert len(buffer.trajectories(True)) == 1 and buffer.size() == 30
-    buffer.drop_unfinished_episodes()
-    assert buffer.size() == 10
+        buffer.add(obs, obs, obs, np.zeros(1), np.array([False]), [{}])
+    # The modes' only successes are still there
+    assert len(buffer.trajectories(True)) == 2 and buffer.size() == 30
 
 
 def test_storage_is_allocated_when_needed_and_released():
@@ -707,14 +723,21 @@ def test_values_that_are_not_finite_in_one_key_of_a_dict():
 
 def test_success_is_what_the_environment_says():
     rule = SuccessRule()
-    assert rule({"is_success": True, "success": False}, 0.0) is True
-    assert rule({"success": np.bool_(True)}, 0.0) is True
-    assert rule({"is_success": 0.0}, 100.0) is False
+
+    def success(*infos):
+        for info in infos:
+            rule.observe([info])
+        said = rule.so_far(0, infos[-1]).success
+        rule.end(0)
+        return said
+
+    assert success({"is_success": True, "success": False}) is True
+    assert success({"success": np.bool_(True)}) is True
+    assert success({"is_success": 0.0}) is False
     # Once an environment gives the flag, an episode without it has failed, whatever its return
-    assert not any(rule({}, episode_return) for episode_return in range(100))
-    assert SuccessRule("solved")({"solved": 1, "is_success": False}, 0.0) is True
+    assert success({}) is False and not any(rule.among_best(episode_return) for episode_return in range(100))
     with pytest.raises(ValueError, match="success_key='solved' is not in an episode's last info; its keys: .*'is_success'"):
-        SuccessRule("solved")({"is_success": True}, 0.0)
+        SuccessRule("solved").check_key({"is_success": True})
 
 
 def test_success_without_a_flag_is_a_return_in_the_top_fifth_of_the_latest():
@@ -724,10 +747,10 @@ def test_success_without_a_flag_is_a_return_in_the_top_fifth_of_the_latest():
         returns.append(float(rng.normal()))
         latest = np.sort(returns[-500:])
         expected = len(returns) >= 5 and returns[-1] >= latest[0] + 0 and returns[-1] >= np.quantile(latest, 0.8)
-        assert rule({}, returns[-1]) == expected
+        assert rule.among_best(returns[-1]) == expected
     # Where all returns are alike, none is a success
     constant = SuccessRule()
-    assert not any(constant({}, 1.0) for _ in range(20))
+    assert not any(constant.among_best(1.0) for _ in range(20))
 
 
 def test_terminal_observation_is_stored_not_the_one_after_the_reset():

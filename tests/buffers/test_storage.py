@@ -26,7 +26,7 @@ FIELDS = {
 }
 # What an accelerator does is here done by the processor, through the same code
 ON_DEVICE = partial(DeviceRows, device=th.device("cpu"))
-ROWS_ON_DEVICE = "sb3_ddiffpg.buffers.trajectory_buffer.make_rows", lambda n_rows, fields, device: ON_DEVICE(n_rows, fields)
+ROWS_ON_DEVICE = "sb3_ddiffpg.buffers.row_buffer.make_rows", lambda n_rows, fields, device: ON_DEVICE(n_rows, fields)
 
 
 @pytest.fixture

@@ -42,12 +42,13 @@ INTEGERS_FROM_ONE = {
     ExplorationSettings: ["n_steps"],
     ModeSettings: ["max_modes", "min_size", "trials", "max_successes", "max_failures", "embedding_dim", "n_steps"],
 }
+NONE_FOR_THE_ALGORITHMS = [(ExplorationSettings, "n_steps"), (ModeSettings, "n_steps")]
 FLAGS = {
     NoveltySettings: ["normalize", "episodic"],
     ExplorationSettings: ["beyond_goals", "off_modes", "past_modes"],
     ModeSettings: ["reset_new_critics"],
 }
-SHARES = {ExplorationSettings: ["fraction", "hand_over"], ModeSettings: ["mask_prob"]}
+SHARES = {ExplorationSettings: ["hand_over"], ModeSettings: ["mask_prob"]}
 NOT_NEGATIVE = {
     CriticSettings: ["target_policy_noise", "target_noise_clip"],
     NoveltySettings: ["scale", "coef"],
@@ -66,7 +67,8 @@ REFUSED = {}
 RIGHT = {}
 for kind, names in INTEGERS_FROM_ONE.items():
     for name in names:
-        REFUSED[kind, name] = [*NO_NUMBERS, None, 0, -1, 1.0, 1.5, np.float64(2.0), 2**63, math.inf]
+        none = [] if (kind, name) in NONE_FOR_THE_ALGORITHMS else [None]
+        REFUSED[kind, name] = [*NO_NUMBERS, *none, 0, -1, 1.0, 1.5, np.float64(2.0), 2**63, math.inf]
         RIGHT[kind, name] = [41, np.int64(50), np.uint8(60)] if name == "max_successes" else [1, 4, np.int64(2), np.uint8(3)]
 for kind, names in FLAGS.items():
     for name in names:
@@ -86,26 +88,28 @@ for kind, of_kind in WORDS.items():
         RIGHT[kind, name] = words
 POSITIVE = [*NO_NUMBERS, *TOO_LARGE, 0, 0.0, -1.0]
 REFUSED |= {
-    (CriticSettings, "v_min"): [*NO_NUMBERS, *TOO_LARGE, None, -math.inf, 5.0, 6],
-    (CriticSettings, "v_max"): [*NO_NUMBERS, *TOO_LARGE, None, 0.0, -1],
+    (CriticSettings, "v_min"): [*NO_NUMBERS, *TOO_LARGE, -math.inf, 5.0, 6],
+    (CriticSettings, "v_max"): [*NO_NUMBERS, *TOO_LARGE, 0.0, -1],
     (TargetActionSettings, "learning_rate"): [*POSITIVE, None],
     (NoveltySettings, "measure"): ["icm", "", "RND", None, 3, int, th.nn.Linear(1, 1), ["rnd"], math.nan],
     (NoveltySettings, "kwargs"): ["cell_size", 3, [("cell_size", 1.0)], math.nan],
     (NoveltySettings, "clip"): [*POSITIVE, None],
     (ExplorationSettings, "share"): [*NO_NUMBERS, -0.1, 1.5, lambda _: math.nan, lambda left: 2 * left, dict, lambda: 0.5],
+    (ExplorationSettings, "fraction"): [*NO_NUMBERS, *TOO_LARGE, -0.01, 1.01, -math.inf],
     (ExplorationSettings, "gamma"): [*NO_NUMBERS, -0.1, 1.1],
     (ExplorationSettings, "v_max"): POSITIVE,
     (ModeSettings, "distance_threshold"): [*NO_NUMBERS, 0, -1.0],
     (ModeSettings, "patience"): [*NO_NUMBERS, None, -1, 0.5],
 }
 RIGHT |= {
-    (CriticSettings, "v_min"): [0, -1e6, np.float64(-3.5), np.int16(-2)],
-    (CriticSettings, "v_max"): [5, 1e6, np.float64(3.5)],
+    (CriticSettings, "v_min"): [None, 0, -1e6, np.float64(-3.5), np.int16(-2)],
+    (CriticSettings, "v_max"): [None, 5, 1e6, np.float64(3.5)],
     (TargetActionSettings, "learning_rate"): [1e-9, 2, np.float32(0.5)],
     (NoveltySettings, "measure"): ["rnd", "counts", VisitCounts, RandomNetworkDistillation],
     (NoveltySettings, "kwargs"): [None, {}, {"cell_size": 2.0}],
     (NoveltySettings, "clip"): [1e-9, 50, np.float32(0.5)],
     (ExplorationSettings, "share"): [None, 0, 1, 0.5, np.float64(0.25), lambda left: left],
+    (ExplorationSettings, "fraction"): [None, 0, 1, 0.5, np.float32(0.25)],
     (ExplorationSettings, "gamma"): [None, 0, 1, 0.5, np.float32(0.5)],
     (ExplorationSettings, "v_max"): [None, 1, 0.5, np.float32(2.5)],
     (ModeSettings, "distance_threshold"): [None, 0.5, 60, math.inf, np.float32(0.5)],
@@ -298,6 +302,7 @@ STRATEGIES = {
     (NoveltySettings, "kwargs"): st.none() | st.fixed_dictionaries({"cell_size": st.floats(0.1, 9.0)}),
     (NoveltySettings, "clip"): st.floats(1e-6, 1e6),
     (ExplorationSettings, "share"): st.none() | st.floats(0.0, 1.0),
+    (ExplorationSettings, "fraction"): st.none() | st.floats(0.0, 1.0),
     (ExplorationSettings, "gamma"): st.none() | st.floats(0.0, 1.0),
     (ExplorationSettings, "v_max"): st.none() | st.floats(1e-6, 1e6),
     (ModeSettings, "distance_threshold"): st.none() | st.floats(1e-6, 1e6),

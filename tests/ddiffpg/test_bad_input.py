@@ -33,17 +33,14 @@ from sb3_ddiffpg.utils.divergence import DivergedError
 
 NUMBERS_FROM_ONE = (
     *("n_diffusion_steps", "recluster_freq", "batch_size", "buffer_size", "critic.n_critics", "critic.n_atoms"),
-    *("target_action.n_steps", "modes.n_steps", "exploration.n_steps", "modes.max_modes", "modes.min_size"),
+    *("target_action.n_steps", "modes.max_modes", "modes.min_size"),
     *("modes.max_successes", "modes.max_failures", "modes.embedding_dim", "modes.trials"),
 )
 BAD_ARGUMENTS = [
     *((name, value) for name in NUMBERS_FROM_ONE for value in (0, -1, 1.5, None, "many", True)),
     *((name, value) for name in ("learning_starts", "modes.patience") for value in (-1, 0.5, None, "x")),
-    *(
-        (name, value)
-        for name in ("gamma", "tau", "modes.mask_prob", "exploration.fraction")
-        for value in (-0.1, 1.1, None, "x")
-    ),
+    *((name, value) for name in ("gamma", "tau", "modes.mask_prob", "exploration.fraction") for value in (-0.1, 1.1, "x")),
+    *((name, None) for name in ("gamma", "tau", "modes.mask_prob")),
     *(
         (name, np.nan)
         for name in (
@@ -76,7 +73,7 @@ BAD_ARGUMENTS = [
     *(("exploration.gamma", value) for value in (-0.1, 1.1, "x", np.nan)),
     *(("exploration.share", value) for value in (-0.1, 1.5, "half")),
     *(("modes.distance_threshold", value) for value in (0, -1.0, "auto", np.nan)),
-    *(("critic.v_min", value) for value in (5.0, 6.0, None, "x")),
+    *(("critic.v_min", value) for value in (5.0, 6.0, "x")),
     ("critic.v_max", -np.inf),
     ("gradient_steps", 1.5),
     ("target_action.optimizer", "adamw"),
@@ -97,10 +94,10 @@ BAD_ARGUMENTS = [
         )
     ),
     ("modes.max_successes", 2),  # fewer than modes.min_size
-    *(("policy_kwargs", {name: 2}) for name in ("n_modes", "n_critics", "support", "mode_embedding_dim")),
+    *(("policy_kwargs", {name: 2}) for name in ("n_modes", "n_atoms", "support", "mode_embedding_dim")),
     ("novelty.kwargs", {"table_size": 0}),
     ("success_key", 5),
-    ("n_steps", 2),
+    *((name, value) for name in ("n_steps", "modes.n_steps", "exploration.n_steps") for value in (0, -1, 1.5, "many", True)),
     ("optimize_memory_usage", True),
     ("replay_buffer_class", ReplayBuffer),
     ("replay_buffer_class", "ModeReplayBuffer"),
@@ -152,7 +149,6 @@ def test_bad_arguments(argument, value):
             "or a subclass of torch.nn.Module like these, got 'icm'",
         ),
         ({"critic": {"v_min": 7.0}}, r"critic.v_min must be less than v_max, got v_min=7.0, v_max=5.0"),
-        ({"n_steps": 3}, "n_steps=3 is not supported: use modes.n_steps and exploration.n_steps instead"),
         ({"mode_features": [7]}, r"mode_features=\[7\] exceeds the observation's 2 components"),
         ({"novelty": {"kwargs": {"cell_size": -1.0}}}, r"novelty.kwargs\['cell_size'\] must be positive, got -1.0"),
     ],
@@ -180,8 +176,8 @@ def test_mode_features_of_dict_observations():
     env = AnySpaces(spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": spaces.Discrete(3)}))
     with pytest.raises(ValueError, match=r"mode_features='c' is not a key of the observation; keys: \['a', 'b'\]"):
         small_model(env, "MultiInputPolicy", mode_features="c")
-    with pytest.raises(ValueError, match="mode_features must be a key or a callable for dict observations, got indices"):
-        small_model(env, "MultiInputPolicy", mode_features=[0])
+    with pytest.raises(ValueError, match=r"mode_features=\[0, 3\] exceeds the observation's 3 components"):
+        small_model(env, "MultiInputPolicy", mode_features=[0, 3])
 
 
 def test_an_action_that_has_no_range():
@@ -241,17 +237,16 @@ def test_a_buffer_too_small_for_the_episodes(tmp_path):
     with pytest.raises(ValueError, match="buffer_size=899 is smaller than one episode of every environment: 3 x 300 steps"):
         model.learn(10)
     small_model(DummyVecEnv([limited] * 3), buffer_size=900).learn(10)
-    # Where the length of an episode is not known, once it is noticed
     # Before the first step, not at it
     wide = DummyVecEnv([lambda: AnySpaces(spaces.Box(-1, 1, (100_000,)))])
     with pytest.raises(ValueError, match="buffer_size=2000000000: there is not so much memory"):
         small_model(wide, buffer_size=2_000_000_000).learn(0)
     with pytest.raises(ValueError, match="buffer_size must be from 1 to 2147483647, got 3000000000"):
         small_model(wide, buffer_size=3_000_000_000)
-    endless = small_model(DummyVecEnv([lambda: AnySpaces(limit=10**9)] * 2), buffer_size=30, learning_starts=100)
-    with pytest.raises(ValueError, match=r"buffer_size=30 transitions is too small: .* 2 environment\(s\)"):
-        endless.learn(100)
-    endless.save(tmp_path / "model")
+    none = small_model(DummyVecEnv([TwoEnds] * 4), buffer_size=3, learning_starts=100)
+    with pytest.raises(ValueError, match=r"buffer_size=3 transitions is too small: .* 4 environment\(s\)"):
+        none.learn(100)
+    none.save(tmp_path / "model")
 
 
 def test_a_success_key_that_is_missing():

@@ -39,7 +39,7 @@ from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_ddiffpg import ClusteringCallback, DDiffPG
+from sb3_ddiffpg import ClusteringCallback, DDiffPG, ModeReplayBuffer
 
 # ---------------------------------------------------------------------- acting
 
@@ -160,12 +160,17 @@ def test_a_dict_of_one_vector_is_that_vector():
     """The same numbers whether an observation comes as a dict or flat."""
     env = AnySpaces(spaces.Dict({"vec": spaces.Box(-1.0, 1.0, (2,))}))
     from_dict = small_model(env, "MultiInputPolicy", **WIDE)
-    untrained = state_of(from_dict)
+
+    def state_as_flat():
+        """The one extractor has the names of the only one."""
+        return {name.replace("extractors.vec.", ""): value for name, value in state_of(from_dict).items()}
+
+    untrained = state_as_flat()
     from_dict.learn(80)
     from_vector = small_model(FlattenObservation(env), **WIDE)
     assert_same_state(untrained, state_of(from_vector))
     from_vector.learn(80)
-    assert_same_state(state_of(from_dict), state_of(from_vector))
+    assert_same_state(state_as_flat(), state_of(from_vector))
     expected, _ = from_vector.predict(some_observations(), deterministic=True)
     np.testing.assert_array_equal(from_dict.predict({"vec": some_observations()}, deterministic=True)[0], expected)
 
@@ -359,12 +364,62 @@ def test_network_architectures(net_arch):
     assert widths == [*actor[1:], 1] and model.actor.diffusion.denoiser.action_in.out_features == actor[0]
 
 
-@pytest.mark.parametrize(
-    "net_arch", [[], {"pi": [], "qf": [4]}, {"pi": [4], "qf": []}, [0], [4, -1], {"pi": [4, 0], "qf": [4]}]
-)
-def test_networks_without_hidden_layer_are_refused(net_arch):
-    with pytest.raises(ValueError, match="net_arch.*at least one hidden layer"):
+@pytest.mark.parametrize("net_arch", [[0], [4, -1], {"pi": [4, 0], "qf": [4]}, {"pi": [4], "qf": [0]}])
+def test_layers_without_units_are_refused(net_arch):
+    with pytest.raises(ValueError, match="net_arch.*hidden layers of at least one unit each"):
         small_model(TwoEnds(), policy_kwargs={"net_arch": net_arch})
+
+
+@pytest.mark.parametrize("net_arch", [[], {"pi": [], "qf": [4]}, {"pi": [4], "qf": []}])
+def test_networks_without_hidden_layers(net_arch, tmp_path):
+    """Linear ones, as in SB3: by a product with one matrix."""
+    model = small_model(DummyVecEnv([TwoEnds] * 4), policy_kwargs={"net_arch": net_arch}, batch_size=600).learn(250)
+    critics, denoiser, actor_arch = model.critics, model.actor.diffusion.denoiser, model.actor.net_arch
+    features, actions = th.randn(critics.n_groups, 200, 2), th.rand(critics.n_groups, 200, 1, requires_grad=True)
+    if not actor_arch:
+        assert len(denoiser.trunk) == 0
+        parts = [layer.weight for layer in (denoiser.condition_in, denoiser.action_in, denoiser.time_in)]
+        condition, noisy, times = th.randn(3, parts[0].shape[1]), th.randn(3, 1), denoiser.time_mlp(denoiser.steps[:3])
+        by_hand = th.cat((condition, noisy, times), dim=1) @ th.cat(parts, dim=1).T + denoiser.condition_in.bias
+        th.testing.assert_close(denoiser(noisy, denoiser.condition_in(condition), denoiser.time_table()[:3]), by_hand)
+    if len(critics.weights) == 1:
+        inputs = th.cat((features, actions), dim=2)
+        by_hand = th.einsum("gni,gcia->gcna", inputs, critics.weights[0]) + critics.biases[0]
+        th.testing.assert_close(critics(features, actions), by_hand)
+    # The ascent's gradient by autograd, for many rows and for few
+    for n in (200, 20):
+        part = actions[:, :n]
+        (expected,) = th.autograd.grad(critics.values(critics(features[:, :n], part)).amin(dim=1).sum(), part)
+        th.testing.assert_close(critics.action_gradient(features[:, :n])(part.detach()), expected, atol=1e-5, rtol=1e-4)
+    model.export(tmp_path / "model.safetensors")
+    loaded = DDiffPG.load(tmp_path / "model.safetensors", safe=True)
+    expected, _ = model.predict(some_observations(), deterministic=True)
+    np.testing.assert_array_equal(loaded.predict(some_observations(), deterministic=True)[0], expected)
+
+
+@pytest.mark.parametrize("n_critics", [1, 3])
+def test_the_number_of_critics_as_sb3_takes_it(n_critics, tmp_path):
+    kwargs = {"net_arch": [4], "n_critics": n_critics}
+    model = small_model(TwoEnds(), policy_kwargs=kwargs).learn(60)
+    assert model.critics.n_critics == model.critic_settings.n_critics == n_critics
+    model.save(tmp_path / "model.zip")
+    model.export(tmp_path / "model.safetensors")
+    loaded = (
+        DDiffPG.load(tmp_path / "model.zip", policy_kwargs=kwargs),
+        DDiffPG.load(tmp_path / "model.safetensors", safe=True),
+    )
+    assert all(each.critics.n_critics == n_critics for each in loaded)
+    with pytest.raises(ValueError, match=r"policy_kwargs\['n_critics'\]=4 given beside critic.n_critics=5"):
+        small_model(TwoEnds(), policy_kwargs={"n_critics": 4}, critic={"n_critics": 5})
+    with pytest.raises(ValueError, match="n_critics must be an integer of at least 1"):
+        small_model(TwoEnds(), policy_kwargs={"n_critics": 0})
+
+
+@pytest.mark.parametrize("name", [None, "mine"])
+def test_logs_have_the_algorithms_name(name, tmp_path):
+    model = DDiffPG("MlpPolicy", TwoEnds(), tensorboard_log=str(tmp_path), **SMALL)
+    model.learn(8, **({} if name is None else {"tb_log_name": name}))
+    assert [path.name for path in tmp_path.iterdir()] == [f"{name or 'DDiffPG'}_1"]
 
 
 @pytest.mark.parametrize(
@@ -529,9 +584,49 @@ def test_learning_rates_have_their_own_schedules():
     assert memory.rows[-1][1]["train/qf_learning_rate"] == 5e-4
 
 
+@pytest.mark.parametrize(
+    ("arguments", "of_exploration", "of_modes"),
+    [
+        ({}, 1, 5),
+        ({"n_steps": 1}, 1, 1),
+        ({"n_steps": 3}, 3, 3),
+        ({"n_steps": 3, "modes": {"n_steps": 4}}, 3, 4),
+        ({"n_steps": 3, "exploration": {"n_steps": 2}}, 2, 3),
+        ({"modes": {"n_steps": 4}}, 1, 4),
+    ],
+)
+def test_length_of_returns(arguments, of_exploration, of_modes, tmp_path):
+    """One number for both returns, where a group does not say its own: told by the discounts of what is drawn."""
+    model = small_model(DummyVecEnv([TwoEnds] * 4), gamma=0.5, **arguments).learn(300)
+    model.save(tmp_path / "model.zip")
+    model.export(tmp_path / "model.safetensors")
+    loaded = [DDiffPG.load(tmp_path / "model.zip"), DDiffPG.load(tmp_path / "model.safetensors", safe=True)]
+    drawn = []
+
+    class Noting(ModeReplayBuffer):
+        def sample_modes(self, *args, **kwargs):
+            drawn.append(super().sample_modes(*args, **kwargs))
+            return drawn[-1]
+
+    model.replay_buffer.__class__ = Noting
+    for each in (model, *loaded):
+        each.replay_buffer = model.replay_buffer
+        each.set_logger(Logger(None, []))
+        drawn.clear()
+        each.train(5, 60)
+        discounts = th.stack([batch.discounts for batch in drawn]).numpy()  # [updates, G, n]: 0 where an episode ends
+        for group, length in ((discounts[:, :1], of_exploration), (discounts[:, 1:], of_modes)):
+            assert group.size and group[group > 0].min() == 0.5**length
+
+
+def test_length_of_returns_is_changed_when_a_model_is_loaded(tmp_path):
+    small_model(TwoEnds(), exploration={"n_steps": 2}).save(tmp_path / "model.zip")
+    loaded = DDiffPG.load(tmp_path / "model.zip", n_steps=4)
+    assert loaded.n_steps == 4 and loaded.exploration_settings.n_steps == 2 and loaded.mode_settings.n_steps is None
+
+
 def test_what_is_not_supported_says_so():
     for arguments, message in (
-        ({"n_steps": 3}, "n_steps=3 is not supported: use modes.n_steps"),
         ({"optimize_memory_usage": True}, "optimize_memory_usage=True is not supported"),
         ({"replay_buffer_class": HerReplayBuffer}, "replay_buffer_class must be ModeReplayBuffer.*got HerReplayBuffer"),
         ({"replay_buffer_class": ReplayBuffer}, "replay_buffer_class must be ModeReplayBuffer"),

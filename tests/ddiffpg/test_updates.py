@@ -34,8 +34,8 @@ def draw(model, batch_size=60, visits_of_modes=False):
     return model.replay_buffer.sample_modes(
         batch_size,
         model.gamma,
-        explores.n_steps,
-        modes.n_steps,
+        explores.n_steps_beside(model.n_steps),
+        modes.n_steps_beside(model.n_steps),
         exploration_gamma=explores.gamma,
         visits_of_modes=visits_of_modes,
     )
@@ -245,14 +245,15 @@ def test_metrics_of_an_update():
 
 
 def test_explorers_may_have_a_horizon_of_their_own():
-    model = trained_model(gamma=0.9, exploration={"gamma": 0.5}, novelty={"coef": 2.0, "clip": 10.0})
+    fixed = {"v_min": 0.0, "v_max": 5.0}
+    model = trained_model(gamma=0.9, exploration={"gamma": 0.5}, novelty={"coef": 2.0, "clip": 10.0}, critic=fixed)
     batch = draw(model, 90, visits_of_modes=True)
     lengths, discounts = batch.visited.present.sum(axis=-1), batch.discounts.numpy()
     for group, gamma in ((0, 0.5), (1, 0.9)):
         goes_on = discounts[group] > 0
         assert goes_on.any()
         np.testing.assert_allclose(discounts[group][goes_on], gamma ** lengths[group][goes_on], rtol=1e-6)
-    assert model.policy.critics.upper.tolist() == [2.0 * 10.0 / (1 - 0.5), model.critic_settings.v_max]
+    assert model.policy.critics.upper.tolist() == [2.0 * 10.0 / (1 - 0.5), 5.0]
 
 
 @pytest.mark.parametrize("n_atoms", [1, 51])

@@ -83,6 +83,8 @@ def test_paths_are_in_metres_behind_a_normalising_wrapper():
 class Labelled(TwoEnds):
     """Says at an episode's end which end it was; the left one only counts as one mode more if it is reached."""
 
+    listed_modes = ()  # what it says is a label
+
     def step(self, action):
         observation, reward, terminated, truncated, info = super().step(action)
         return observation, reward, terminated, truncated, {**info, "mode": "left" if self.x < 0 else "right"}
@@ -155,7 +157,7 @@ def test_numbers_as_observations():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "name"), [((TwoEnds(), 2), "env"), ((None, 0), "n_episodes"), ((None, 7.0), "n_episodes")]
+    ("arguments", "name"), [((TwoEnds, 2), "env"), ((None, 0), "n_episodes"), ((None, 7.0), "n_episodes")]
 )
 def test_bad_arguments(arguments, name):
     env = arguments[0] or DummyVecEnv([TwoEnds])

@@ -19,7 +19,7 @@ from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.callbacks.evaluation import EvaluateModesCallback
 from sb3_ddiffpg.evaluation.results import ModeEvaluation
 from sb3_ddiffpg.experiments import __main__ as cli
-from sb3_ddiffpg.experiments import machine
+from sb3_ddiffpg.experiments import machine, training  # noqa: F401 - imported here, or what a test replaces in it would stay
 from sb3_ddiffpg.experiments.ablations import ABLATIONS
 from sb3_ddiffpg.experiments.curve import Clock, CurveCallback
 
@@ -124,8 +124,9 @@ def test_a_way_that_is_not_listed_has_a_column_from_the_test_on_that_takes_it(mo
         return step, SimpleNamespace(
             label_source="environment",
             listed=("a",),
+            success_told=True,
             commanded=(),
-            uncommanded=SimpleNamespace(n_episodes=4, labels=labels, success_rate=1.0),
+            uncommanded=SimpleNamespace(n_episodes=4, labels=labels, success_rate=1.0, mean_return=1.0),
             commanded_modes=1.0,
             robust_modes=1,
             expected_modes=lambda: 1.0,
@@ -212,7 +213,7 @@ def test_an_ablation_is_trained_with_the_settings_of_ddiffpg(monkeypatch, tmp_pa
     """And its part is useless while it trains, not when it is loaded to act."""
     done = record(monkeypatch, tmp_path / "a", "--env", "PointMazeV1-v0", "--algo", algo, "--override", SMALL)
     assert done["algo"] == algo and done["result"]["complete"]
-    assert done["hyperparams"]["exploration"] == {"v_max": 10, "n_steps": 3}
+    assert done["hyperparams"]["exploration"] == {"fraction": 0.7, "n_steps": 3}
     model = ABLATIONS[algo].load(tmp_path / "a" / "model.zip")
     plain = DDiffPG.load(tmp_path / "a" / "model.zip")
     assert model._n_updates > 0 and model.modes.names == plain.modes.names

@@ -9,11 +9,12 @@ from environments import copied
 
 from sb3_ddiffpg.buffers.batch import VisitedSteps
 from sb3_ddiffpg.buffers.trajectory import StepRecord
-from sb3_ddiffpg.exploration.bonus import ExplorationBonus, make_bonus
+from sb3_ddiffpg.exploration.bonus import ExplorationBonus
+from sb3_ddiffpg.exploration.bonus_factory import make_bonus
+from sb3_ddiffpg.exploration.cells import CellGrid
 from sb3_ddiffpg.exploration.known_regions import NO_ROUTE, KnownRoute
 from sb3_ddiffpg.exploration.novelty import RandomNetworkDistillation, VisitCounts
 from sb3_ddiffpg.exploration.settings import ExplorationSettings, NoveltySettings
-from sb3_ddiffpg.exploration.visit_map import VisitMap
 from sb3_ddiffpg.serialization.safetensors_tree import read, write
 from sb3_ddiffpg.utils.divergence import DivergenceWatch
 
@@ -32,8 +33,7 @@ class Alone:
             settings=NoveltySettings(**{"normalize": False, "scale": 0.0, "coef": 1.0, **settings}),
             exploration=ExplorationSettings() if exploration is None else exploration,
             n_envs=n_envs,
-            cell_size=1.0,
-            visit_map=VisitMap(1, 1.0),
+            grid=CellGrid(1, 1.0),
         )
         self.notes = SimpleNamespace(
             first_visits=np.zeros(100, dtype=bool), followed=np.full(100, -7, np.int32), counted=np.zeros(100, dtype=bool)
@@ -322,17 +322,34 @@ def test_what_cannot_be_is_refused(change, message):
 # ---------------------------------------------------------------------- how it is made
 
 
+def made_of(settings, exploration, dims, counted_cell, seen_cell):
+    return make_bonus(
+        lambda kind, *dims, **kwargs: kind(*dims, **kwargs), settings, exploration, dims, 4, counted_cell, seen_cell
+    )
+
+
 def test_what_a_bonus_is_made_of():
-    made = make_bonus(lambda kind, *dims, **kwargs: kind(*dims, **kwargs), NoveltySettings(), None, (2, 3), 4, 0.2, 1.5)
-    assert isinstance(made.novelty_model, VisitCounts) and made.novelty_model.cell_size == made.cell_size == 0.2
-    assert made.known_cells is None and made.visit_map.cell_size == 1.5 and made.visit_map.dim == 2
+    made = made_of(NoveltySettings(), None, (2, 3), 0.2, 1.5)
+    assert isinstance(made.novelty_model, VisitCounts) and not made.grid.adapts
+    np.testing.assert_array_equal(made.grid.edges, [0.2, 0.2])
+    th.testing.assert_close(made.novelty_model.edges, th.tensor([0.2, 0.2]))
+    assert made.known_cells is None and made.visit_map.dim == 2 and made.visit_map.cell_size.tolist() == [1.5, 1.5]
     made.load_state_dict(copied(made.state_dict()))
     own = NoveltySettings(kwargs={"cell_size": 0.7})
     exploration = ExplorationSettings()
-    made = make_bonus(lambda kind, *dims, **kwargs: kind(*dims, **kwargs), own, exploration, (4, 3), 4, 0.2, 1.5)
-    assert made.cell_size == made.novelty_model.cell_size == made.known_cells.cell_size == 0.7 and made.visit_map is None
+    made = made_of(own, exploration, (4, 3), 0.2, 1.5)
+    assert made.visit_map is None and made.grid.edges.tolist() == [0.7] * 4
+    for table in (made.novelty_model, made.known_cells):
+        th.testing.assert_close(table.edges, th.full((4,), 0.7))
     rnd = NoveltySettings(measure="rnd", kwargs={"net_arch": (8, 4)})
-    made = make_bonus(lambda kind, *dims, **kwargs: kind(*dims, **kwargs), rnd, exploration, (2, 3), 4, 0.2, 1.5)
-    assert isinstance(made.novelty_model, RandomNetworkDistillation) and made.cell_size == 1.5
+    made = made_of(rnd, exploration, (2, 3), 0.2, 1.5)
+    assert isinstance(made.novelty_model, RandomNetworkDistillation) and made.grid.edges.tolist() == [1.5, 1.5]
     with pytest.raises(ValueError, match=r"novelty.kwargs\['cell_size'\] must be positive, got 0"):
-        make_bonus(VisitCounts, NoveltySettings(kwargs={"cell_size": 0}), None, (2, 3), 4, 0.2, 1.5)
+        made_of(NoveltySettings(kwargs={"cell_size": 0}), None, (2, 3), 0.2, 1.5)
+
+
+def test_where_nobody_says_a_size_there_are_no_cells_yet():
+    made = made_of(NoveltySettings(), ExplorationSettings(), (2, 3), None, None)
+    assert made.grid.adapts and made.grid.edges is None and made.visit_map is None and made.n_cells == 0
+    # A map for pictures has cells of its own, but begins when places are told apart
+    assert made_of(NoveltySettings(), ExplorationSettings(), (2, 3), None, 1.0).visit_map is None

@@ -26,6 +26,38 @@ def test_who_explores():
     assert scheduler.exploration_share(1.0) == 1.0 and {scheduler.draw(0.0) for _ in range(20)} == {EXPLORATORY_GROUP}
 
 
+def test_exploration_becomes_less_where_nothing_new_has_come():
+    """From when the run is ten times as long as at the last news, whatever the progress."""
+    scheduler = scheduler_of(2)
+    scheduler.note_news(1000, 50, born=False)  # the first places
+    for progress in (1.0, 0.0):
+        assert scheduler.exploration_share(progress, 10_000) == pytest.approx(1 / 3)
+        assert scheduler.exploration_share(progress, 20_000) == pytest.approx(1 / 6)
+        assert scheduler.exploration_share(progress, 10**6) == pytest.approx(1 / 300)
+    scheduler.note_news(2000, 52, born=False)  # four in a hundred more are none
+    assert (scheduler.news_at, scheduler.n_cells) == (1000, 50)
+    scheduler.note_news(2500, 53, born=False)
+    assert (scheduler.news_at, scheduler.n_cells) == (2500, 53)
+    assert scheduler.exploration_share(0.0, 25_000) == pytest.approx(1 / 3)
+    assert scheduler.exploration_share(0.0, 25_100) < 1 / 3 - 1e-3
+    scheduler.note_news(76_000, 53, born=True)  # it goes on in full for what was born
+    assert scheduler.news_at == 76_000 and scheduler.exploration_share(0.0, 228_000) == pytest.approx(1 / 3)
+    scheduler.note_news(80_000, 20, born=False)  # cells are larger now, and fewer: no news
+    assert scheduler.news_at == 76_000
+    scheduler.note_news(90_000, 22, born=False)
+    assert scheduler.news_at == 90_000
+
+
+def test_while_there_is_no_mode_exploration_goes_on():
+    """Also where no places are counted, or nothing has been noted yet: modes could not be born."""
+    scheduler = scheduler_of(0)
+    for step in (0, 1, 10**6):
+        assert scheduler.exploration_share(0.0, step) == 1.0
+    scheduler.note_news(500, 0, born=False)
+    assert scheduler.news_at == 0 and scheduler.exploration_share(0.0, 10**6) == 1.0
+    assert scheduler_of(0, fraction=0.5).exploration_share(0.2, 10) == 0.0  # who names a part, gets that
+
+
 def test_modes_and_the_zero_embedding_take_turns():
     scheduler = scheduler_of(3)
     drawn = [scheduler.draw(0.0) for _ in range(9)]
@@ -113,6 +145,7 @@ def in_use():
     scheduler = scheduler_of(2, hand_over=0.5)
     scheduler.begin_all(20, 0.5)
     scheduler.hand_over(0.5)
+    scheduler.note_news(700, 30, born=False)
     return scheduler
 
 
@@ -144,6 +177,8 @@ def test_what_a_scheduler_knows_is_kept(tmp_path):
         (lambda state: state.update(explored=np.zeros(20)), 20, "episodes.explored"),
         (lambda state: state.update(may_hand_over=np.zeros(3, dtype=bool)), 20, "episodes.may_hand_over"),
         (lambda state: state.update(n_turns=-1), 20, "n_turns"),
+        (lambda state: state.update(news_at=-1), 20, "news_at"),
+        (lambda state: state.update(n_cells=0.5), 20, "n_cells"),
         (lambda state: state.pop("handed_over"), 20, "handed_over"),
         (lambda state: state.update(more=1), 20, "more"),
     ],
@@ -156,3 +191,10 @@ def test_what_cannot_be_is_refused_before_anything_is_lost(change, n_envs, messa
     with pytest.raises(ValueError, match=message):
         scheduler.load_state_dict(state, n_envs)
     assert str(scheduler.state_dict()) == before
+
+
+def test_a_state_of_version_0_1_has_no_news():
+    state = {name: each for name, each in in_use().state_dict().items() if name not in ("news_at", "n_cells")}
+    scheduler = scheduler_of(2)
+    scheduler.load_state_dict(copied(state), 20)
+    assert scheduler.news_at == scheduler.n_cells == 0

@@ -17,6 +17,7 @@ from sb3_ddiffpg.buffers.mode_buffer import ModeReplayBuffer
 from sb3_ddiffpg.buffers.state import buffer_state, restore_buffer
 from sb3_ddiffpg.clustering.paths import N_PATH_POINTS
 from sb3_ddiffpg.exploration.bonus import ExplorationBonus
+from sb3_ddiffpg.exploration.cells import CellGrid
 from sb3_ddiffpg.exploration.known_regions import NO_ROUTE, KnownRoute, KnownRoutes, come_along
 from sb3_ddiffpg.exploration.novelty import VisitCounts
 from sb3_ddiffpg.exploration.settings import ExplorationSettings, NoveltySettings
@@ -153,7 +154,7 @@ class Line:
     def __init__(self, n_envs=1):
         self.buffer = ModeReplayBuffer(500, LINE, ACTION, device="cpu", n_envs=n_envs)
         counts, exploration = VisitCounts(1, 1, cell_size=1.0), ExplorationSettings(past_modes=False)
-        self.bonus = ExplorationBonus(counts, 1, NoveltySettings(), exploration, n_envs, cell_size=1.0)
+        self.bonus = ExplorationBonus(counts, 1, NoveltySettings(), exploration, n_envs, CellGrid(1, 1.0))
         for _ in range(4):
             for x in range(10):
                 self.add([x] * n_envs, [x + 1] * n_envs, x == 9)
@@ -325,7 +326,7 @@ def test_resuming_and_reclustering_follow_the_same_route_where_two_are_completed
             for _ in range(2):  # as it was resumed, and after a re-clustering
                 assert each.bonus.routes.followed.tolist() == followed
                 np.testing.assert_array_equal(each.bonus.routes._been, line.bonus.routes._been)
-                assert each.bonus._seen == line.bonus._seen
+                assert each.bonus.episode_cells.seen == line.bonus.episode_cells.seen
                 assert len(each.watch({0: 5, 1: 6})) == 0
     assert told[0] == NO_ROUTE and told[-1] == 6 and set(told) == {NO_ROUTE, 6}
 
@@ -367,7 +368,8 @@ def test_what_is_known_no_more_pays_again():
 @pytest.mark.parametrize("novelty", ["rnd", "counts"])
 def test_when_all_environments_are_past_known_routes(novelty):
     """There is nothing to observe: the mean of nothing is NaN."""
-    model = planar_model(novelty=novelty, exploration={"past_modes": False})
+    kwargs = {} if novelty == "rnd" else {"cell_size": 0.5}
+    model = planar_model(novelty={"measure": novelty, "kwargs": kwargs}, exploration={"past_modes": False})
     walk(model, "up", 6)
     model.recluster()
     make_able(model, [0])

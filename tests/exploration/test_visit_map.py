@@ -4,7 +4,8 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from environments import TwoEnds, small_model
+import torch as th
+from environments import AnySpaces, TwoEnds, small_model
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -55,40 +56,50 @@ def test_a_run_counts_where_it_has_been(tmp_path):
 
 
 def test_cells_are_those_of_the_environment():
-    assert small_model(make_vec_env("PointMazeV1-v0", 2)).visits.cell_size == 1.0
-    assert small_model(DummyVecEnv([TwoEnds])).visits.cell_size == 0.5
-    assert small_model("Pendulum-v1", modes={"max_modes": 2}).visits.dim == 3
-    assert small_model("MountainCarContinuous-v0").visits.dim == 2
+    assert small_model(make_vec_env("PointMazeV1-v0", 2)).visits.cell_size.tolist() == [1.0, 1.0]
+    assert small_model(DummyVecEnv([TwoEnds])).visits.cell_size.tolist() == [0.5]
+    for name, dim in (("Pendulum-v1", 3), ("MountainCarContinuous-v0", 2)):  # they declare none: it follows
+        model = small_model(name, modes={"max_modes": 2})
+        assert model.visits is None and model.learn(400).visits.dim == dim
 
 
 class Tiny(TwoEnds):
-    novelty_cell_size = 0.02
+    def __init__(self, cell=0.02, **kwargs):
+        super().__init__(**kwargs)
+        self.novelty_cell_size = cell
+
+
+def cells_of(model):
+    """The edge of all cells by which places are told apart, None if it follows from what is seen."""
+    bonus = model.bonus
+    if bonus.grid.edges is None:
+        return None
+    edges = {float(each) for each in bonus.grid.edges}
+    for table in (bonus.novelty_model, bonus.known_cells):
+        th.testing.assert_close(table.edges, th.as_tensor(bonus.grid.edges, dtype=th.float32))
+    assert len(edges) == 1 and not bonus.grid.adapts
+    return edges.pop()
 
 
 def test_novelty_counts_in_the_cells_that_the_environment_declares(tmp_path):
     model = small_model(DummyVecEnv([Tiny]))
-    bonus = model.bonus
-    assert bonus.novelty_model.cell_size == bonus.cell_size == bonus.known_cells.cell_size == 0.02
-    own = small_model(DummyVecEnv([Tiny]), novelty={"kwargs": {"cell_size": 0.3}})
-    assert own.bonus.novelty_model.cell_size == own.bonus.cell_size == 0.3
-    assert small_model(DummyVecEnv([TwoEnds])).bonus.novelty_model.cell_size == 0.5
+    assert cells_of(model) == 0.02
+    assert cells_of(small_model(DummyVecEnv([Tiny]), novelty={"kwargs": {"cell_size": 0.3}})) == 0.3
+    assert cells_of(small_model(DummyVecEnv([AnySpaces]))) is None
     # It belongs to the environment's own features, not to yours
-    assert small_model(DummyVecEnv([Tiny]), mode_features=[1]).bonus.novelty_model.cell_size == 0.5
+    assert cells_of(small_model(DummyVecEnv([Tiny]), mode_features=[1])) is None
     # Also where there is no environment that says it, or one that says something else: what was counted stays
     model.save(tmp_path / "model")
     model.export(tmp_path / "model.safetensors")
     for loaded in (DDiffPG.load(tmp_path / "model"), DDiffPG.load(tmp_path / "model.safetensors", safe=True)):
-        assert loaded.bonus.novelty_model.cell_size == 0.02
-    assert DDiffPG.load(tmp_path / "model", env=DummyVecEnv([TwoEnds])).bonus.novelty_model.cell_size == 0.02
+        assert cells_of(loaded) == 0.02
+    assert cells_of(DDiffPG.load(tmp_path / "model", env=DummyVecEnv([TwoEnds]))) == 0.02
 
 
-@pytest.mark.parametrize("declared", [0, -1.0, None, "wide", float("inf"), float("nan")])
+@pytest.mark.parametrize("declared", [0, -1.0, "wide", float("inf"), float("nan")])
 def test_cells_that_cannot_be_are_refused_by_the_name_of_who_declared_them(declared):
-    class Odd(TwoEnds):
-        novelty_cell_size = declared
-
     with pytest.raises(ValueError, match=r"The environment declares novelty_cell_size=.*: it must be a positive number"):
-        small_model(DummyVecEnv([Odd]))
+        small_model(DummyVecEnv([lambda: Tiny(declared)]))
 
 
 @pytest.mark.parametrize(

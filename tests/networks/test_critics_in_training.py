@@ -107,7 +107,7 @@ def test_the_first_steps_of_a_newborn_mode_are_about_a_learning_rate_long(seed, 
         model.train(1, 32)
         changes = [(now.detach()[newborn] - then).abs() for now, then in zip(parameters, before, strict=True)]
         moved = th.cat([change[change > 1e-9] for change in changes])
-        assert len(moved) > 500 and 0.1 < moved.mean().item() / learning_rate < 1.0
+        assert len(moved) > 500 and 0.03 < moved.mean().item() / learning_rate < 1.0
 
 
 @pytest.mark.parametrize("amsgrad", [False, True])

@@ -15,6 +15,7 @@ import pytest
 import torch as th
 from environments import SMALL, KnownEnds, TwoEnds, assert_same_state, copied, merged, state_of
 from filelock import FileLock
+from gymnasium import spaces
 from rl_zoo3 import gym_patches
 from stable_baselines3.common.callbacks import (
     BaseCallback,
@@ -75,6 +76,9 @@ def outcome(model):
         "observations": np.asarray(model._last_obs).tolist(),
         "infos": [(float(each["r"]), int(each["l"])) for each in model.ep_info_buffer],
         "cells": None if model.visits is None else sorted(model.visits._counts.items()),
+        "measured": (str(model.bonus.grid.edges), str(model.value_range.state_dict()), model.next_review),
+        "features": (str(model.resolved_features), model.features_found, model.features_settled),
+        "news": (model.scheduler.news_at, model.scheduler.n_cells) if hasattr(model, "scheduler") else None,
     }
 
 
@@ -106,6 +110,44 @@ def test_exactly(tmp_path, seed):
     assert len(whole.modes) == 2 and min(born) > END // 8  # so that some checkpoints lie before, some after
 
 
+class NothingDeclared(KnownEnds):
+    """Of which nobody says where modes differ, in which unit, or what a goal is worth."""
+
+    def __init__(self):
+        super().__init__()
+        del self.mode_features, self.cell_size, self.novelty_cell_size
+        self.observation_space = spaces.Box(-np.inf, np.inf, (5,))
+        self.last = 0.0
+
+    def _observation(self):
+        speed, self.last = self.x - self.last, self.x
+        return np.array([1e3 * self.x, self.steps / self.limit, 2.0, speed, self.steps % 2], dtype=np.float32)
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        return observation, 100.0 * reward - 1.0, *rest
+
+    def state_dict(self):
+        return {**super().state_dict(), "last": self.last}
+
+    def load_state_dict(self, state):
+        super().load_state_dict({name: each for name, each in state.items() if name != "last"})
+        self.last = state["last"]
+
+
+@pytest.mark.parametrize("algorithm", [DDiffPG, BASELINES["sac_c51"]])
+def test_where_everything_follows_what_is_met(tmp_path, algorithm):
+    """Ranges of values, cells, mode features and inputs are measured on the way, also between two checkpoints."""
+    env = partial(DummyVecEnv, [NothingDeclared] * 4)
+    critic = {} if algorithm is DDiffPG else {"critic": {"v_min": -100.0, "v_max": 100.0}}
+    whole = assert_goes_on_the_same(env, tmp_path, at=(0, 2, 4, 6), algorithm=algorithm, **critic)
+    assert whole.features_found and 0 in whole.resolved_features and 2 not in whole.resolved_features
+    assert whole.bonus.grid.adapts and whole.next_review > END
+    if algorithm is DDiffPG:
+        assert whole.value_range.low < 0 < 90 < whole.value_range.high and 0 < whole.scheduler.news_at <= END
+        assert whole.scheduler.n_cells > 0
+
+
 def test_past_known_routes(tmp_path, monkeypatch):
     """Where an episode has come along a route after its first steps, some have at most checkpoints."""
     monkeypatch.setattr("sb3_ddiffpg.exploration.known_regions.SHARE_GONE", 0.2)
@@ -123,6 +165,37 @@ def test_with_a_full_buffer_and_wrappers(tmp_path):
 
     whole = assert_goes_on_the_same(make_env, tmp_path, buffer_size=150, at=(1, 4, 6))
     assert whole.replay_buffer.full
+
+
+class KnownGoals(KnownEnds):
+    """That go on at a goal, which is told only there; from far beyond it the point returns to the middle. ``ends``: ever."""
+
+    def __init__(self, ends=True):
+        super().__init__(limit=13)
+        self.ends = ends
+
+    def _observation(self):
+        return super()._observation() % 2
+
+    def step(self, action):
+        observation, reward, reached, truncated, _ = super().step(action)
+        if abs(self.x) > 1.5:
+            self.x = 0.0
+        if not self.ends:
+            self.steps %= 99
+        return observation, reward, False, truncated and self.ends, {"is_success": True, "mode": "there"} if reached else {}
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_past_goals_and_in_parts(tmp_path, monkeypatch, ends):
+    """Where an episode has passed its goal at a checkpoint, or so long ago that the buffer has no trace of it."""
+    monkeypatch.setattr("sb3_ddiffpg.exploration.known_regions.SHARE_GONE", 0.2)
+    settings = {} if ends else {"buffer_size": 150, "exploration": {"past_modes": False, "fraction": 1.0}}
+    whole = assert_goes_on_the_same(lambda: DummyVecEnv([lambda: KnownGoals(ends)] * 2), tmp_path, at=(1, 4, 6), **settings)
+    assert whole.replay_buffer.groups.past_goals()
+    resumed = [DDiffPG.resume(path, DummyVecEnv([lambda: KnownGoals(ends)] * 2)) for path in checkpoint_files(tmp_path)]
+    assert sum(each.replay_buffer.success_rule.goal_steps.any() for each in resumed) >= 2
+    assert (len(resumed[0].bonus._in_parts) == 2) == (not ends)
 
 
 # So that what each counts makes a difference

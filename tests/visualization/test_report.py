@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from html.parser import HTMLParser
 
+import gymnasium as gym
 import imageio.v3 as imageio
 import numpy as np
 import pytest
@@ -48,7 +49,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     env = make_vec_env("PointMazeV1-v0", 4, seed=0, maze_map=MAP)
     test_env = make_vec_env("PointMazeV1-v0", 2, seed=1, maze_map=MAP, start_noise=0.0)
-    model = small_model(env, modes={"patience": 0})
+    model = small_model(env, modes={"patience": 0, "distance_threshold": 2.0})
     model.set_logger(configure(str(folder / "tb"), ["tensorboard"]))
     evaluation = EvaluateModesCallback(test_env, eval_freq=900, n_episodes=2, path=folder / "log" / "evaluations.jsonl")
     model.learn(2400, callback=[ModeFigureCallback(1200, test_env, n_episodes=1), evaluation])
@@ -249,17 +250,28 @@ def test_what_cannot_be_shown(tmp_path):
     small_model(DummyVecEnv([TwoEnds])).save(tmp_path / "model")
     arguments = [str(tmp_path / "model.zip"), "--output", str(tmp_path / "page.html")]
     for extra, message in (
-        ([], "--env: not given, and the model does not remember"),
-        (["--env", "Nowhere-v0"], "--env: 'Nowhere-v0' is not registered"),
+        ([], "env: not given, and the model does not remember"),
+        (["--env", "Nowhere-v0"], "env: 'Nowhere-v0' is not registered"),
         (["--replay-buffer", str(tmp_path / "no.pkl")], "no.pkl does not exist"),
         (["--episodes", "0"], "--episodes: 0 given"),
         (["--output", str(tmp_path)], "accepted is the path of a page"),
         (["--output", str(tmp_path / "page.json")], "accepted is the path of a page"),
-        (["--env", "Pendulum-v1"], "--env: Pendulum-v1 has observations and actions"),
+        (["--env", "Pendulum-v1"], "env: Pendulum-v1 has observations and actions"),
         (["--env", "PointMazeV1-v0", "--env-kwargs", "no_such=1"], "PointMazeV1-v0 cannot be made with"),
     ):
         with pytest.raises(SystemExit, match=message):
             main([*arguments, *extra])
+
+
+def test_a_model_of_a_single_environment_of_others(tmp_path):
+    """The command makes the environment again that ``gymnasium.make`` made, though nothing of it is ours."""
+    small_model(gym.make("MountainCarContinuous-v0", max_episode_steps=30), critic={"v_min": -20.0}).save(
+        tmp_path / "model.zip"
+    )
+    main([str(tmp_path / "model.zip"), "--output", str(tmp_path / "page.html"), "--episodes", "1", "--no-videos"])
+    found = ModeEvaluation.load(tmp_path / "page.json")
+    assert found.env_id == "MountainCarContinuous-v0" and found.uncommanded.mean_length == 30
+    assert "MountainCarContinuous-v0" in (tmp_path / "page.html").read_text()
 
 
 def test_normalised_observations(tmp_path):

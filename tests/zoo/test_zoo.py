@@ -118,7 +118,7 @@ def test_resume(run, tmp_path):
     expected = settings_of(before)
     expected["critic"] = replace(expected["critic"], v_max=3.0)
     expected["exploration"] = replace(expected["exploration"], n_steps=2)
-    assert settings_of(after) == expected and expected["exploration"].v_max == 10
+    assert settings_of(after) == expected and expected["exploration"].fraction == 0.7  # of the file
     # the buffer came along, so that every step was one of the policy and was learnt from
     assert after.learning_starts == 0
     assert after.replay_buffer.size() * 4 > 800
@@ -521,7 +521,7 @@ def test_the_command_line_changes_single_settings(tmp_path):
     main([*command, "--hyperparams", *small, "critic.v_max:3", "novelty:{'coef': 0.2}", "exploration.n_steps:2"])
     first, second = (DDiffPG.load(tmp_path / "ddiffpg" / f"{ENV}_{run}" / f"{ENV}.zip") for run in (1, 2))
     expected = settings_of(first)
-    assert (expected["exploration"].v_max, expected["exploration"].n_steps) == (10, 3)  # of the file
+    assert (expected["exploration"].fraction, expected["exploration"].n_steps) == (0.7, 3)  # of the file
     expected["critic"] = replace(expected["critic"], v_max=3)
     expected["novelty"] = replace(expected["novelty"], coef=0.2)
     expected["exploration"] = replace(expected["exploration"], n_steps=2)

@@ -20,7 +20,7 @@ from sb3_ddiffpg.serialization.random_states import restore_generator
 from sb3_ddiffpg.serialization.safetensors_tree import check_array, convert
 
 #: Edge of the floor's cells in which visits are counted, in metres
-VISIT_CELL = 1.0
+NOVELTY_CELL, VISIT_CELL = 0.5, 1.0
 # A step takes 0.1 s, whatever the body
 _METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
@@ -74,7 +74,7 @@ class MazeEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         #: Indices of the position in the observation.
         self.mode_features = np.array([0, 1])
         self.listed_modes = self.maze.listed_routes
-        self.cell_size = VISIT_CELL
+        self.cell_size, self.novelty_cell_size = VISIT_CELL, NOVELTY_CELL
         self.observation_space = self.simulation.observation_space()
         self.action_space = self.simulation.action_space()
         self.render_mode = render_mode
@@ -162,7 +162,7 @@ class MazeVecEnv(VecEnv):
         self.maze = self.simulation.maze
         self.mode_features = np.array([0, 1])
         self.listed_modes = self.maze.listed_routes
-        self.cell_size = VISIT_CELL
+        self.cell_size, self.novelty_cell_size = VISIT_CELL, NOVELTY_CELL
         self.max_episode_steps = max_episode_steps
         self.spec: EnvSpec | None = None
         # VecEnv's constructor asks get_attr for the render mode
