@@ -142,8 +142,7 @@ class PathReplayBuffer(TrajectoryReplayBuffer):
 
     def _deviations(self) -> np.ndarray:
         """Standard deviation of each mode feature, [dim]; of what has not moved its size, whatever the unit."""
-        rows = self.stored_rows.rows[: self.stored_rows.size]
-        positions = self.positions(self.steps, "observations", rows[:: len(rows) // _MEASURED + 1]).astype(np.float64)
+        positions = self.positions(self.steps, "observations", self.stored_rows.spread(_MEASURED)).astype(np.float64)
         size = np.abs(positions).max(axis=0)
         moved = positions.std(axis=0) > 1e-6 * size
         return np.where(moved, positions.std(axis=0), np.where(size > 0, size, 1.0)).astype(np.float32)

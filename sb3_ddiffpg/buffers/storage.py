@@ -236,6 +236,13 @@ class RowSet:
         """
         return self.rows[np.random.randint(0, self.size, size=n)]
 
+    def spread(self, most: int) -> np.ndarray:
+        """
+        :param most: Number of rows, at most
+        :return: Rows from all over the set, always the same ones, shape [at most ``most``]
+        """
+        return self.rows[: self.size : self.size // most + 1]
+
 
 def storage_place(asked: th.device | str, samples: th.device) -> th.device:
     """

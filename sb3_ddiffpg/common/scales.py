@@ -38,10 +38,9 @@ def review_scales(model: Any) -> None:
     if steps < model.next_review:
         return
     model.next_review = int(REVIEW_AGAIN * steps) + 1
-    rows = buffer.stored_rows.rows[: buffer.size()]
-    seen = buffer.read_observations(rows[:: len(rows) // REVIEWED_STEPS + 1])[0]
+    seen = buffer.read_observations(buffer.stored_rows.spread(REVIEWED_STEPS))[0]
     model.policy.adapt_inputs(buffer.normalized(seen, model._vec_normalize_env))
-    if may_choose(model) and not model.features_found:
+    if not model.features_found and may_choose(model):
         _choose(model, buffer.episodes(), ())
     if buffer.review_scale():
         model.bonus.forget_routes()

@@ -98,7 +98,7 @@ def evaluate_modes(
         uncommanded=results[-1],
         commanded=tuple(results[:-1]),
         routes=_routes(runs, labels),
-        success_told=any(episode.success is not None for run in runs for episode in run),
+        success_told=told,
         episodes={command_name(command): run for command, run in zip(commands, runs, strict=True)},
     )
 

@@ -22,14 +22,12 @@ from sb3_ddiffpg.exploration.novelty import (
     VisitCounts,
     noveld_reward,
 )
-from sb3_ddiffpg.exploration.recount import count_again
+from sb3_ddiffpg.exploration.recount import AT_A_TIME, count_again, places_of
 from sb3_ddiffpg.exploration.settings import ExplorationSettings, NoveltySettings
 from sb3_ddiffpg.exploration.visit_map import VisitMap
 from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
 from sb3_ddiffpg.utils.divergence import DivergenceWatch
 
-# Rows of which visits are taken back at a time
-_AT_A_TIME = 50_000
 # Steps from which the cells' size is measured, at most
 _SAMPLE = 20_000
 
@@ -163,12 +161,8 @@ class ExplorationBonus:
         :param buffer: Holds the steps
         :param mastered: As for ``on_modes_changed``
         """
-        rows = buffer.stored_rows.rows[: buffer.stored_rows.size]
-        sample = rows[:: len(rows) // _SAMPLE + 1]
-        before = self.grid.edges
-        if not self.grid.fit(buffer.positions(buffer.nexts, "next_observations", sample)) or before is self.grid.edges:
-            return
-        self.recount(buffer, mastered)
+        if self.grid.fit(buffer.positions(buffer.nexts, "next_observations", buffer.stored_rows.spread(_SAMPLE))):
+            self.recount(buffer, mastered)
 
     def _resize_tables(self, edges: np.ndarray) -> None:
         for table in (self.novelty_model, self.known_cells):
@@ -222,9 +216,7 @@ class ExplorationBonus:
         for env, seen in enumerate(self.episode_cells.seen):
             rows = buffer.running.of(env)
             if len(rows) and self.settings.episodic and self.grid.edges is not None:
-                start = buffer.positions(buffer.steps, "observations", rows[:1])
-                reached = buffer.positions(buffer.nexts, "next_observations", rows)
-                seen.update(numbers_of_cells(np.concatenate((start, reached)), self.grid))
+                seen.update(numbers_of_cells(places_of(buffer, rows), self.grid))
         self._recall_routes(buffer)
 
     def _recall_routes(self, buffer: ModeReplayBuffer) -> None:
@@ -339,7 +331,7 @@ class ExplorationBonus:
             self.known_cells.replace({mastered[mode]: self._places(buffer, each) for mode, each in members.items()})
         uncounted = self._watch_routes(buffer, {} if self.exploration.past_modes else members, mastered)
         if len(uncounted) and hasattr(self.novelty_model, "forget"):
-            for rows in np.array_split(uncounted, -(-len(uncounted) // _AT_A_TIME)):
+            for rows in np.array_split(uncounted, -(-len(uncounted) // AT_A_TIME)):
                 self.novelty_model.forget(buffer.features.of_tensors(buffer.read_observations(rows)[1]))
 
     @staticmethod

@@ -9,8 +9,18 @@ from sb3_ddiffpg.exploration.episode_cells import first_visits
 from sb3_ddiffpg.exploration.novelty import VisitCounts
 from sb3_ddiffpg.exploration.visit_map import VisitMap
 
-# Rows that are read at a time
-_AT_A_TIME = 50_000
+#: Rows of which visits are counted, or taken back, at a time
+AT_A_TIME = 50_000
+
+
+def places_of(buffer: ModeReplayBuffer, rows: np.ndarray) -> np.ndarray:
+    """
+    :param buffer: Holds an episode
+    :param rows: Its rows, at least one, shape [length]
+    :return: Mode features where it started, and those that it reached, shape [length + 1, dim]
+    """
+    start = buffer.positions(buffer.steps, "observations", rows[:1])
+    return np.concatenate((start, buffer.positions(buffer.nexts, "next_observations", rows)))
 
 
 def count_again(
@@ -24,13 +34,11 @@ def count_again(
     :param first: Whether to note anew which steps saw a cell first in their episode
     """
     rows = buffer.stored_rows.rows[: buffer.stored_rows.size]
-    for some in np.array_split(rows, -(-len(rows) // _AT_A_TIME)) if len(rows) else []:
+    for some in np.array_split(rows, -(-len(rows) // AT_A_TIME)) if len(rows) else []:
         positions = buffer.positions(buffer.nexts, "next_observations", some)
         if counts is not None:
             counts.observe(th.as_tensor(positions[buffer.counted[some]], device=counts.counts.device))
         if visit_map is not None:
             visit_map.observe(positions)
     for episode in buffer.episodes() if first else []:
-        start = buffer.positions(buffer.steps, "observations", episode[:1])
-        reached = buffer.positions(buffer.nexts, "next_observations", episode)
-        buffer.first_visits[episode] = first_visits(np.concatenate((start, reached)), grid)[1:]
+        buffer.first_visits[episode] = first_visits(places_of(buffer, episode), grid)[1:]
