@@ -167,19 +167,19 @@ def image_dict_space(channel_last: bool = False) -> spaces.Dict:
 def fill(
     buffer: ModeReplayBuffer,
     paths: Sequence[np.ndarray],
-    success: bool = True,
+    success: bool | None = True,
     reward: float = 1.0,
     bonus: ExplorationBonus | None = None,
 ) -> None:
     """
     One environment walks along each path (an array [length + 1, dim]) and ends there, with the reward at the end. The bonus
-    sees each step, if there is one.
+    sees each step, if there is one. No step says whether there was a success where that is None.
     """
     for path in paths:
         for k in range(len(path) - 1):
             last = k == len(path) - 2
             action = np.clip(path[k + 1] - path[k], -1, 1)[None, : buffer.action_dim]
-            infos = [{"is_success": success and last}]
+            infos = [{} if success is None else {"is_success": success and last}]
             record = buffer.add(path[k][None], path[k + 1][None], action, np.array([reward * last]), np.array([last]), infos)
             if bonus is not None:
                 bonus.observe(record, buffer)

@@ -18,13 +18,13 @@ def planar_model(**changes):
     return small_model(AnySpaces(PLANE), **merged(settings, changes))
 
 
-def walk(model, route, n, success=True, part=1.0):
-    """The model's environment takes a route n times (or fails on the way)."""
+def walk(model, route, n, success=True, part=1.0, reward=1.0):
+    """The model's environment takes a route n times (or fails on the way, or says nothing of it)."""
     rng = np.random.default_rng(len(model.replay_buffer.trajectories(True)))
     for _ in range(n):
         line = polyline(ROUTES[route], step=1.0) + rng.uniform(-0.3, 0.3, 2)
         line = line[: int(part * len(line))] + rng.normal(scale=0.1, size=(int(part * len(line)), 2))
-        fill(model.replay_buffer, [line.astype(np.float32)], success, bonus=model.bonus)
+        fill(model.replay_buffer, [line.astype(np.float32)], success, reward, bonus=model.bonus)
 
 
 def said(model):

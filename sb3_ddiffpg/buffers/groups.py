@@ -1,6 +1,7 @@
 """Finished trajectories by mode and outcome: which of them leave the buffer first."""
 
 from collections import deque
+from collections.abc import Callable
 
 from sb3_ddiffpg.buffers.trajectory import NO_MODE, PAST_GOAL, Trajectory
 
@@ -71,14 +72,16 @@ class TrajectoryGroups:
         """
         return list(self.members.get((PAST_GOAL, False), ()))
 
-    def take_back_successes(self) -> None:
-        """None of the trajectories has reached a goal: they are failures of their modes."""
+    def judge_again(self, is_success: Callable[[Trajectory], bool]) -> None:
+        """
+        :param is_success: Says of each trajectory whether it counts as a success of its mode from now on
+        """
         for trajectory in self.retired:
-            trajectory.success = False
+            trajectory.success = is_success(trajectory)
         members = [each for group in self.members.values() for each in group]
         self.members, self.n_rows = {}, {}
         for trajectory in sorted(members, key=lambda trajectory: trajectory.serial):
-            trajectory.success = False
+            trajectory.success = trajectory.mode != PAST_GOAL and is_success(trajectory)
             self.insert(trajectory)
 
     def clear(self) -> None:

@@ -246,6 +246,7 @@ class ModeReplayBuffer(PathReplayBuffer):
         """
         Hand the trajectories to their new modes and rebuild the modes' rows. Each mode learns from its newest direct successes
         and its newest failures, and remembers as many detours for the next clustering; the rest retires to exploration.
+        While nobody has said what a success is, a long one is no detour, and a mode goes on learning from what has retired.
 
         :param successes: In order of finishing
         :param success_modes: New mode of each, ``NO_MODE`` for outliers
@@ -258,6 +259,7 @@ class ModeReplayBuffer(PathReplayBuffer):
         self.groups.clear()
         self.unfounded_modes = {new for new, old in enumerate(parents) if old in self.unfounded_modes}
         self.mode_rows = [self.make_row_set() for _ in parents]
+        self._follow_retired(parents)
         stays: list[Trajectory] = []
         goes: list[Trajectory] = list(abandoned)
         for trajectories, modes, limit in (
@@ -266,9 +268,7 @@ class ModeReplayBuffer(PathReplayBuffer):
         ):
             for mode in range(NO_MODE, len(parents)):
                 members = [trajectories[i] for i in np.flatnonzero(np.asarray(modes) == mode)]
-                direct, detours = (
-                    ([], members) if mode == NO_MODE else split_detours(members, self.max_length_ratio, self.min_direct)
-                )
+                direct, detours = self._split(members, mode)
                 for trajectory in members:
                     trajectory.trains = False
                 for trajectory in direct[-limit:]:
@@ -289,11 +289,38 @@ class ModeReplayBuffer(PathReplayBuffer):
             if trajectory.trains:
                 self.mode_rows[trajectory.mode].add(trajectory.rows)
         for trajectory in sorted(goes, key=lambda t: t.serial):
-            trajectory.mode, trajectory.trains, trajectory.path = NO_MODE, False, None
+            trajectory.trains = trajectory.mode != NO_MODE and not self.has_success_signal
+            if trajectory.trains:
+                self.mode_rows[trajectory.mode].add(trajectory.rows)
+            else:
+                trajectory.mode = NO_MODE
+            trajectory.path = None
             self.route_novelty[trajectory.rows[-1]] = 0.0
             self.groups.retired.append(trajectory)
         new_routes = [trajectory.rows for trajectory in stays if self.route_novelty[trajectory.rows[-1]] > 0]
         self.new_route_rows = np.concatenate([self.new_route_rows[:0], *new_routes])
+
+    def _split(self, members: list[Trajectory], mode: int) -> tuple[list[Trajectory], list[Trajectory]]:
+        """Those of a mode's trajectories that may train it, and those that are only remembered."""
+        if mode == NO_MODE:
+            return [], members
+        if not self.has_success_signal:
+            return members, []
+        return split_detours(members, self.max_length_ratio, self.min_direct)
+
+    def _follow_retired(self, parents: list[int | None]) -> None:
+        """
+        Retired trajectories go on training the heir of their mode, if nobody has said what a success is: a dense reward has
+        something to say at every step, not only where a route is taken.
+        """
+        heirs = {old: new for new, old in reversed(list(enumerate(parents)))}  # the largest part, where there are several
+        for trajectory in self.groups.retired:
+            heir = None if self.has_success_signal else heirs.get(trajectory.mode)
+            if trajectory.mode == NO_MODE or heir is None:
+                trajectory.mode, trajectory.trains = NO_MODE, False
+            else:
+                self._change_mode(trajectory, heir, parents)
+                self.mode_rows[heir].add(trajectory.rows)
 
     def training_successes(self, modes: Collection[int]) -> dict[int, list[Trajectory]]:
         """

@@ -11,6 +11,8 @@ import numpy as np
 from sb3_ddiffpg.utils.vec_envs import route_label
 
 SUCCESS_KEYS = ("is_success", "success")
+#: Of the returns seen lately, while nobody has said what a success is
+BEST_SHARE = 0.2
 
 
 def read_success(info: dict[str, Any], success_key: str | None = None) -> bool | None:
@@ -143,12 +145,25 @@ class SuccessRule(GoalWatch):
         :param episode_return: Of an episode that has just been stored
         :return: Whether it is in the top fifth of those seen lately
         """
-        if self.has_signal or self.success_key is not None:
+        if not self._stands_in:
             return False
         self.recent_returns.append(episode_return)
-        if len(self.recent_returns) < 5:
-            return False
-        return bool(episode_return >= np.quantile(self.recent_returns, 0.8) and episode_return > min(self.recent_returns))
+        least = self.best_from()
+        return least is not None and episode_return >= least
+
+    def best_from(self) -> float | None:
+        """
+        :return: The return from which an episode is among the best; None if nothing stands in for a success, or all are alike
+        """
+        returns = np.array(self.recent_returns)
+        more = returns[returns > returns.min(initial=np.inf)]
+        if not self._stands_in or not len(more):
+            return None
+        return float(max(np.quantile(returns, 1 - BEST_SHARE, method="higher"), more.min()))
+
+    @property
+    def _stands_in(self) -> bool:
+        return not self.has_signal and self.success_key is None
 
     def check_key(self, info: dict[str, Any]) -> None:
         """

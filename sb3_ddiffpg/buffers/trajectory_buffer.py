@@ -230,7 +230,16 @@ class TrajectoryReplayBuffer(RowReplayBuffer):
         Judge again what is stored. Until an environment said for the first time what a success is, the best returns stood in
         for successes; of those episodes none has reached a goal, or it would have been said.
         """
-        self.groups.take_back_successes()
+        self.groups.judge_again(lambda trajectory: False)
+
+    def judge_by_returns(self) -> None:
+        """
+        While nobody has said what a success is: take those for it whose returns are the best by now. What was among the best
+        at its time may be none any more, and the first were judged beside nothing.
+        """
+        least = self.success_rule.best_from()
+        if least is not None:
+            self.groups.judge_again(lambda trajectory: trajectory.episode_return >= least)
 
     def drop_unfinished_episodes(self) -> None:
         """Forget the transitions of running episodes: call it when the environments were reset outside."""

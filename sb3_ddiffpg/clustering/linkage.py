@@ -51,6 +51,18 @@ def cluster(
     return _numbered([group for group in groups if len(group) >= min_size], n)
 
 
+def without_outliers(labels: np.ndarray, distances: np.ndarray) -> np.ndarray:
+    """
+    :param labels: as :func:`cluster` gives them, of shape ``[n]``
+    :param distances: of the same trajectories
+    :return: the labels with every outlier in the group of the trajectory nearest to it; if there is no group, all are one
+    """
+    members = np.flatnonzero(labels >= 0)
+    if not len(members):
+        return np.zeros_like(labels)
+    return np.where(labels >= 0, labels, labels[members[distances[:, members].argmin(axis=1)]])
+
+
 def automatic_labels(distances: np.ndarray, linkage: str = "average", max_modes: int = 10, min_size: int = 3) -> np.ndarray:
     """
     Clusters without a threshold: the same answer whatever the unit of the distances, and possibly a single one.

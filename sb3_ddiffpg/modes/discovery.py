@@ -87,7 +87,7 @@ def find_modes(
     successes = [trajectory for trajectory in found if trajectory.mode not in retired]
     distances = np.zeros((len(successes), len(successes)), dtype=np.float32)
     labels = np.full(len(successes), NO_MODE)
-    if len(successes) >= settings.min_size:
+    if len(successes) >= (settings.min_size if buffer.has_success_signal else 1):
         distances = buffer.success_distances(successes)
         labels = cluster(distances)
 
@@ -120,6 +120,19 @@ def retired_modes(modes: Sequence[Mode], trials: int) -> list[int]:
     """
     missing = [index for index, mode in enumerate(modes) if mode.misses >= trials and not mode.frozen]
     return missing if len(missing) < len(modes) else []
+
+
+def surpassed_modes(modes: Sequence[Mode], trials: int, buffer: ModeReplayBuffer) -> list[int]:
+    """
+    Where nobody says what a success is, only the best episodes are of modes.
+
+    :param modes: The modes so far
+    :param trials: Commanded episodes in a row that must not have been among the best
+    :param buffer: Holds the trajectories
+    :return: Indices of modes that have none among the best any more. None if that is true of all
+    """
+    among_best = {trajectory.mode for trajectory in buffer.trajectories(success=True)}
+    return [index for index in retired_modes(modes, trials) if index not in among_best] if among_best - {NO_MODE} else []
 
 
 def readmit_homeless(buffer: ModeReplayBuffer, numbers: set[int]) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 
 from sb3_ddiffpg.buffers.mode_buffer import ModeReplayBuffer
 from sb3_ddiffpg.buffers.trajectory import NO_MODE, Trajectory
-from sb3_ddiffpg.clustering.linkage import cluster
-from sb3_ddiffpg.modes.discovery import find_modes, readmit_homeless, retired_modes
+from sb3_ddiffpg.clustering.linkage import cluster, without_outliers
+from sb3_ddiffpg.modes.discovery import find_modes, readmit_homeless, retired_modes, surpassed_modes
 from sb3_ddiffpg.modes.history import ModeEvent, ModeHistory, succeed
 from sb3_ddiffpg.modes.mode import Mode, ModeTable, Outcome, check_name, default_name, modes_from_state, modes_state
 from sb3_ddiffpg.modes.settings import ModeSettings
@@ -100,7 +100,11 @@ class ModeManager:
         :return: What happened: births, splits, merges and retirements
         """
         self.success_is_told = buffer.has_success_signal
-        retired = retired_modes(self.modes, self.settings.trials) if buffer.has_success_signal else []
+        if self.success_is_told:
+            retired = retired_modes(self.modes, self.settings.trials)
+        else:
+            buffer.judge_by_returns()
+            retired = surpassed_modes(self.modes, self.settings.min_size, buffer)
         # Those of successes that were none, unless the user keeps them
         unfounded = {index for index in buffer.unfounded_modes if not self.modes[index].frozen}
         buffer.unfounded_modes, retired = set(), sorted({*retired, *unfounded})
@@ -126,7 +130,9 @@ class ModeManager:
         settings = self.settings
         if settings.max_modes == 1:
             return np.zeros(len(distances), dtype=int)  # clustering off: whatever reaches the goal is the one mode
-        return cluster(distances, settings.distance_threshold, settings.linkage, settings.max_modes, settings.min_size)
+        labels = cluster(distances, settings.distance_threshold, settings.linkage, settings.max_modes, settings.min_size)
+        # The best so far is always a way to begin with, as single and unlike the others as it may be; a goal is not
+        return labels if self.success_is_told else without_outliers(labels, distances)
 
     def hold(self, modes: list[Mode], buffer: ModeReplayBuffer, followers: Followers) -> None:
         """

@@ -214,6 +214,7 @@ def test_a_best_episode_that_ran_out_of_time_is_no_goal():
     buffer = make_buffer()
     for total in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):
         episode(buffer, np.arange(4.0), [{}] * 3, [0.0, 0.0, total], "truncated")
+    buffer.judge_by_returns()
     own_mode(buffer)
     assert [t.episode_return for t in buffer.trajectories(True)] == [4.0, 5.0]
     batch = buffer.sample_modes(200, GAMMA, 1, 1)
@@ -224,15 +225,78 @@ def test_a_best_episode_that_ran_out_of_time_is_no_goal():
 # ---------------------------------------------------------------------- judged again
 
 
+def test_the_best_are_those_of_now():
+    """The best fifth of the returns, by hand: what was among the best when it came may be none, the first is judged too."""
+    buffer = make_buffer()
+    for total in (9.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 0.0):
+        episode(buffer, np.arange(4.0), [{}] * 3, [0.0, 0.0, total], "truncated")
+    assert [t.episode_return for t in buffer.trajectories(True)] == [5.0, 6.0, 7.0, 8.0]  # when they came
+    buffer.judge_by_returns()
+    assert [t.episode_return for t in buffer.trajectories(True)] == [9.0, 8.0]
+    assert [t.serial for t in buffer.trajectories(False)] == [1, 2, 3, 4, 5, 6, 7, 9]
+    # Fewer than a fifth, where all others are alike
+    rare = make_buffer()
+    for total in (0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0):
+        episode(rare, np.arange(4.0), [{}] * 3, [0.0, 0.0, total], "truncated")
+    rare.judge_by_returns()
+    assert [t.episode_return for t in rare.trajectories(True)] == [0.5, 1.0]
+    # Once an environment says what a success is, returns say nothing
+    episode(buffer, np.arange(4.0), [{}, {}, {"is_success": True}], [0.0, 0.0, -5.0], "terminated")
+    buffer.judge_by_returns()
+    assert [t.episode_return for t in buffer.trajectories(True)] == [-5.0]
+    # Nor where a key is waited for, or where all are alike
+    for other, total in ((make_buffer(success_key="solved"), 1.0), (make_buffer(), 0.0)):
+        for k in range(5):
+            episode(other, np.arange(4.0), [{}] * 3, [0.0, 0.0, k * total], "truncated")
+        other.judge_by_returns()
+        assert other.trajectories(True) == []
+
+
+def test_modes_of_a_dense_reward_learn_from_all_their_episodes():
+    """From long ones, old ones and retired ones; where successes are told, from the newest direct ones."""
+    for told in (False, True):
+        buffer = make_buffer(max_successes_per_mode=3, max_failures_per_mode=2)
+        for k in range(12):
+            said = {"is_success": k % 2 == 0} if told else {}
+            episode(buffer, np.linspace(0, 1, 3 + k), [{}] * (1 + k) + [said], [float(k % 2 == 0)] * (2 + k), "truncated")
+        buffer.groups.judge_again(lambda trajectory: trajectory.serial % 2 == 0)
+        for parents in ([None], [0], [None, 0]):  # a birth; the mode goes on; it is the second one now
+            mine = len(parents) - 1
+            parts = buffer.trajectories(True), buffer.trajectories(False)
+            buffer.assign_modes(parts[0], np.full(len(parts[0]), mine), parts[1], np.full(len(parts[1]), mine), parents)
+        rows = buffer.mode_rows[1]
+        assert buffer.mode_rows[0].size == 0
+        # Told: the 3 newest that are no detours, and 2 failures
+        expected = sum(2 + k for k in (6, 8, 10, 9, 11)) if told else buffer.size()
+        assert rows.size == expected == sum(t.length for t in _all(buffer) if t.trains)
+        # It leaves the mode with the buffer's storage, and comes back from a file
+        other = make_buffer(max_successes_per_mode=3, max_failures_per_mode=2)
+        other.expect_modes(2)
+        restore_buffer(other, buffer_state(buffer))
+        np.testing.assert_array_equal(np.sort(other.mode_rows[1].rows[: rows.size]), np.sort(rows.rows[: rows.size]))
+        gone = buffer._evict()
+        assert rows.size == expected - gone.length * gone.trains
+        # With the first word, a mode of what was no success ends
+        if not told:
+            episode(buffer, np.arange(3.0), [{}, {"success": True}], [0.0] * 2, "terminated")
+            parts = buffer.trajectories(True), buffer.trajectories(False)
+            buffer.assign_modes(parts[0], np.zeros(1), parts[1], np.full(len(parts[1]), NO_MODE), [None])
+            assert buffer.mode_rows[0].size == 2
+
+
+def _all(buffer):
+    return [*(each for group in buffer.groups.members.values() for each in group), *buffer.groups.retired]
+
+
 def test_what_stood_in_for_successes_is_taken_back():
     """With the first word of the environment, in mid-episode; by hand."""
     buffer = make_buffer(new_route_share=0.25)
     for total in range(10):
         episode(buffer, np.arange(4.0), [{}] * 3, [0.0, 0.0, float(total)], "truncated")
     before = buffer.trajectories(True)
-    assert [t.episode_return for t in before] == [4.0, 5.0, 6.0, 7.0, 8.0, 9.0] and not buffer.has_success_signal
+    assert [t.episode_return for t in before] == [*range(1, 10)] and not buffer.has_success_signal
     successes, failures = before, buffer.trajectories(False)
-    buffer.assign_modes(successes, np.array([0, 0, 0, 1, 1, NO_MODE]), failures, np.array([0, 1, 1, 1]), [None, None])
+    buffer.assign_modes(successes, np.array([0] * 4 + [1] * 4 + [NO_MODE]), failures, np.array([1]), [None, None])
     assert len(buffer.new_route_rows)
     sizes = [row_set.size for row_set in buffer.mode_rows]
     episode(buffer, np.arange(9.0), [{}, {}, {"is_success": True}, {}], [0.0] * 4, None)

@@ -8,7 +8,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import pdist, squareform
 
 from sb3_ddiffpg.clustering.dtw import dtw_distances
-from sb3_ddiffpg.clustering.linkage import LINKAGES, automatic_labels, cluster
+from sb3_ddiffpg.clustering.linkage import LINKAGES, automatic_labels, cluster, without_outliers
 from sb3_ddiffpg.clustering.matching import ModeMatching, assign_to_nearest, match_modes, medoid
 from sb3_ddiffpg.clustering.paths import resample_path
 
@@ -432,3 +432,17 @@ def test_every_mode_has_one_fate(data, n_old, n_new, n):
     best = max(sum(padded[i, j] for i, j in enumerate(order)) for order in permutations(range(len(padded))))
     kept_overlap = sum(overlap[p, i] for i, (p, k) in enumerate(zip(result.parents, result.kept, strict=True)) if k)
     assert kept_overlap == best
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_outliers_go_with_the_nearest_member(seed):
+    """By brute force; without any group, all are one."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(12, 2))
+    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    labels = rng.integers(-1, 3, 12)
+    found = without_outliers(labels, distances)
+    for i, label in enumerate(labels):
+        others = [j for j in range(12) if labels[j] >= 0]
+        assert found[i] == (label if label >= 0 else labels[min(others, key=lambda j: distances[i, j])])
+    np.testing.assert_array_equal(without_outliers(np.full(3, -1), distances[:3, :3]), 0)

@@ -286,3 +286,51 @@ def test_what_cannot_be_is_refused(change, message):
     change(state)
     with pytest.raises(ValueError, match=message):
         ModeManager(SETTINGS).load_state_dict(state)
+
+
+# ---------------------------------------------------------------------- nobody tells a success
+
+
+def dense(alone, *returns, route="up"):
+    """Episodes along a route, of which only the return is known."""
+    for each in returns:
+        walk(SimpleNamespace(replay_buffer=alone.buffer, bonus=None), route, 1, None, reward=each)
+
+
+def test_the_best_episode_so_far_is_a_mode():
+    """However unlike the others: what a dense reward says is learned from at once. A single goal-reached one is none."""
+    alone = Alone()
+    dense(alone, 3.0)
+    assert alone.recluster() == []  # beside nothing it is not the best
+    dense(alone, 1.0, 2.0, route="down")
+    assert alone.recluster() == ["mode_0 born"]
+    assert [route_of(mode) for mode in alone.manager.modes] == ["up"]
+    assert alone.buffer.mode_rows[0].size == alone.buffer.size()
+    told = Alone()
+    told.walk("up", 1)
+    assert told.recluster() == [] and told.buffer.has_success_signal
+
+
+def test_a_mode_that_the_best_have_left_behind_ends():
+    """Commanded in vain as often as makes a mode, and without an episode among the best: unless it is the last, or kept."""
+    alone = Alone()
+    dense(alone, *[8.0] * 5)
+    dense(alone, *[9.0] * 5, route="down")
+    dense(alone, *[1.0] * 50, route="right")
+    alone.recluster()
+    assert sorted(route_of(mode) for mode in alone.manager.modes) == ["down", "up"]
+    up = next(mode for mode in alone.manager.modes if route_of(mode) == "up")
+    dense(alone, *[9.0] * 20, route="down")
+    up.misses = SETTINGS.min_size - 1
+    alone.recluster()
+    assert up in alone.manager.modes  # it may yet
+    up.misses, up.frozen = SETTINGS.min_size, True
+    alone.recluster()
+    assert up in alone.manager.modes
+    up.frozen = False
+    assert alone.recluster() == [f"{up.name} retired"]
+    # The last one goes on, wherever the best go now
+    (last,) = alone.manager.modes
+    last.misses = 10 * SETTINGS.min_size
+    dense(alone, *[20.0] * 30, route="right")
+    assert alone.recluster() == [] and route_of(last) == "right"
