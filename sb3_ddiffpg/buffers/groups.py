@@ -42,6 +42,25 @@ class TrajectoryGroups:
         self.members[key].remove(trajectory)
         self.n_rows[key] -= trajectory.length
 
+    def retire(self, trajectory: Trajectory, trains: bool) -> None:
+        """
+        :param trajectory: In use no more: from now on it serves exploration
+        :param trains: Whether its mode, if it has one, goes on learning from it
+        """
+        trajectory.trains = trains and trajectory.mode != NO_MODE
+        trajectory.mode = trajectory.mode if trajectory.trains else NO_MODE
+        trajectory.path = None
+        self.retired.append(trajectory)
+
+    def take_training(self) -> list[Trajectory]:
+        """
+        :return: Retired trajectories that train a mode, which are none of the retired any more
+        """
+        training = [trajectory for trajectory in self.retired if trajectory.trains]
+        if training:
+            self.retired = deque(trajectory for trajectory in self.retired if not trajectory.trains)
+        return training
+
     def pop_oldest(self) -> Trajectory | None:
         """
         :return: The trajectory that leaves first, None if none may

@@ -259,7 +259,6 @@ class ModeReplayBuffer(PathReplayBuffer):
         self.groups.clear()
         self.unfounded_modes = {new for new, old in enumerate(parents) if old in self.unfounded_modes}
         self.mode_rows = [self.make_row_set() for _ in parents]
-        self._follow_retired(parents)
         stays: list[Trajectory] = []
         goes: list[Trajectory] = list(abandoned)
         for trajectories, modes, limit in (
@@ -288,15 +287,11 @@ class ModeReplayBuffer(PathReplayBuffer):
             self._insert(trajectory)
             if trajectory.trains:
                 self.mode_rows[trajectory.mode].add(trajectory.rows)
-        for trajectory in sorted(goes, key=lambda t: t.serial):
-            trajectory.trains = trajectory.mode != NO_MODE and not self.has_success_signal
+        for trajectory in [*self._still_training(parents), *sorted(goes, key=lambda t: t.serial)]:
+            self.groups.retire(trajectory, trains=not self.has_success_signal)
             if trajectory.trains:
                 self.mode_rows[trajectory.mode].add(trajectory.rows)
-            else:
-                trajectory.mode = NO_MODE
-            trajectory.path = None
             self.route_novelty[trajectory.rows[-1]] = 0.0
-            self.groups.retired.append(trajectory)
         new_routes = [trajectory.rows for trajectory in stays if self.route_novelty[trajectory.rows[-1]] > 0]
         self.new_route_rows = np.concatenate([self.new_route_rows[:0], *new_routes])
 
@@ -304,23 +299,16 @@ class ModeReplayBuffer(PathReplayBuffer):
         """Those of a mode's trajectories that may train it, and those that are only remembered."""
         if mode == NO_MODE:
             return [], members
-        if not self.has_success_signal:
-            return members, []
-        return split_detours(members, self.max_length_ratio, self.min_direct)
+        told = self.has_success_signal
+        return split_detours(members, self.max_length_ratio, self.min_direct) if told else (members, [])
 
-    def _follow_retired(self, parents: list[int | None]) -> None:
-        """
-        Retired trajectories go on training the heir of their mode, if nobody has said what a success is: a dense reward has
-        something to say at every step, not only where a route is taken.
-        """
+    def _still_training(self, parents: list[int | None]) -> list[Trajectory]:
+        """Retired trajectories that train a mode, taken from the others, with the heirs of their modes."""
         heirs = {old: new for new, old in reversed(list(enumerate(parents)))}  # the largest part, where there are several
-        for trajectory in self.groups.retired:
-            heir = None if self.has_success_signal else heirs.get(trajectory.mode)
-            if trajectory.mode == NO_MODE or heir is None:
-                trajectory.mode, trajectory.trains = NO_MODE, False
-            else:
-                self._change_mode(trajectory, heir, parents)
-                self.mode_rows[heir].add(trajectory.rows)
+        training = self.groups.take_training()
+        for trajectory in training:
+            self._change_mode(trajectory, heirs.get(trajectory.mode, NO_MODE), parents)
+        return training
 
     def training_successes(self, modes: Collection[int]) -> dict[int, list[Trajectory]]:
         """
