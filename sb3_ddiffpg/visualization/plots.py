@@ -20,6 +20,8 @@ from sb3_ddiffpg.modes.mode import Mode
 
 # Share of the cells whose visits have a colour of their own; the rest, near the start, would outshine them
 _TOLD_APART = 0.95
+# Axes have one scale unless one of them is so many times as long
+MOST_STRETCHED = 5.0
 # Words stay legible over whatever colour
 _OUTLINE = [withStroke(linewidth=2, foreground="w")]
 
@@ -86,10 +88,17 @@ def _in_plane(positions: np.ndarray) -> np.ndarray:
     return positions[:, :2] if positions.shape[1] > 1 else np.concatenate((positions, np.zeros_like(positions)), axis=1)
 
 
-def _label_axes(axes: Any, names: Sequence[str] = ("x [m]", "y [m]")) -> None:
-    axes.set_aspect("equal")
-    axes.set_xlabel(names[0])
-    axes.set_ylabel(names[1])
+def _label_axes(axes: Any, maze: Any, components: Sequence[int] = (0, 1)) -> None:
+    """Of what is drawn: metres in a maze; elsewhere nobody has said which unit, nor whether it is the same on both axes."""
+    spans = axes.dataLim.size
+    alike = maze is not None or spans.max() <= MOST_STRETCHED * spans.min()
+    axes.set_aspect("equal" if alike else "auto")
+    names = ("x [m]", "y [m]") if maze is not None else _names(components)
+    axes.set(**dict(zip(("xlabel", "ylabel"), names, strict=False)))  # a single one has no second
+
+
+def _names(components: Sequence[int]) -> list[str]:
+    return [f"mode feature {component}" for component in components]
 
 
 def plot_routes(
@@ -112,14 +121,13 @@ def plot_routes(
     if in_space:
         views = [figure.add_subplot(1, 3, 1, projection="3d"), figure.add_subplot(1, 3, 2), figure.add_subplot(1, 3, 3)]
         components = [[0, 1, 2], [0, 1], [0, 2]]
-        views[0].set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-        _label_axes(views[1])
-        _label_axes(views[2], ("x [m]", "z [m]"))
+        views[0].set(**dict(zip(("xlabel", "ylabel", "zlabel"), _names(components[0]), strict=True)))
     else:
         views, components = [figure.subplots()], [[0, min(1, dim - 1)]]
-        _label_axes(views[0])
     for axes, parts in zip(views, components, strict=True):
         draw_routes(axes, episodes, maze, colors, parts)
+        if len(parts) == 2:
+            _label_axes(axes, maze, parts)
     figure.legend(*views[-1].get_legend_handles_labels(), loc="outside right upper")
     return figure
 
@@ -219,7 +227,7 @@ def draw_visits(axes: Any, visits: VisitMap, maze: Any = None, most: float | Non
     image = axes.imshow(shown.T, origin="lower", extent=extent, norm=LogNorm(1, most), cmap="viridis", alpha=0.85, zorder=0.5)
     if maze is not None:
         axes.set(xlim=maze.extent[:2], ylim=maze.extent[2:])
-    _label_axes(axes)
+    _label_axes(axes, maze, range(centres.shape[1])[:2])
     return image
 
 
@@ -262,7 +270,7 @@ def draw_values(
     low, high = (values.min(), values.max()) if limits is None else limits
     size = 30_000 / max(len(positions), 1) if maze is not None else 12
     image = axes.scatter(*_in_plane(positions).T, c=values, s=size, marker="s", vmin=low, vmax=high, zorder=0.5)
-    _label_axes(axes)
+    _label_axes(axes, maze, range(positions.shape[1])[:2])
     return image
 
 

@@ -74,9 +74,22 @@ def test_routes_of_an_arm_are_seen_from_three_sides():
     assert space.name == "3d"
     np.testing.assert_array_equal(above.lines[0].get_xydata(), [[0, 0], [1, 2]])
     np.testing.assert_array_equal(side.lines[0].get_xydata(), [[0, 0], [1, 3]])
+    assert [axes.get_ylabel() for axes in figure.axes] == ["mode feature 1", "mode feature 1", "mode feature 2"]
     assert [line.get_linestyle() for line in above.lines if len(line.get_xdata())] == ["-", "--"]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b"]
     assert len(plot_routes({"a": []}).axes) == 1
+
+
+@pytest.mark.parametrize(("width", "aspect"), [(2.0, 1.0), (5e4, "auto")])
+def test_axes_of_no_maze_say_which_components_they_are(width, aspect):
+    """Nobody has said that these are metres, or both the same: on one scale an angle beside them would be a line."""
+    axes = plot_routes({"a": [episode([[0, 0], [width, 1], [width, 2]])]}).axes[0]
+    assert axes.get_aspect() == aspect
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("mode feature 0", "mode feature 1")
+    visits = VisitMap(1, 0.1)
+    visits.observe(np.linspace(0, 2, 50)[:, None])
+    axes = plot_exploration(visits).axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("mode feature 0", "")
 
 
 def test_density_is_capped_and_lies_where_the_visits_were():
