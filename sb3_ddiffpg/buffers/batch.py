@@ -36,7 +36,7 @@ class ModeBatch(NamedTuple):
     not train it. ``imitated`` [G, n] is False for these and for steps of off-mode successes, which the policy must not
     learn. ``new_routes`` [n] are the exploratory group's returns from goals reached by routes of which a mode has not its
     fill. ``rows`` [G, n] say where in the buffer the transitions lie, ``dormant`` which groups are not
-    active, ``visited`` what novelty is paid for.
+    active, ``visited`` what novelty is paid for, ``relabelled`` [G, n] which of them were given another goal (None: none).
     """
 
     observations: Any
@@ -51,3 +51,4 @@ class ModeBatch(NamedTuple):
     rows: np.ndarray
     dormant: list[int]
     visited: VisitedSteps
+    relabelled: np.ndarray | None = None

@@ -83,6 +83,7 @@ class EnvCheck:
     :param limit: Steps after which an episode is cut off; None: none was seen or declared
     :param declared_limit: Whether that is declared, not only seen
     :param success: What the steps said of success
+    :param relabels: Whether transitions are given other goals, see ``Hindsight``; None: there are none
     :param features: In which part of the observation modes differ
     :param cells: By which places are told apart
     :param rewards: The smallest and the largest
@@ -104,6 +105,7 @@ class EnvCheck:
     limit: int | None
     declared_limit: bool
     success: SuccessSignal
+    relabels: bool | None
     features: ChosenFeatures
     cells: Cells
     rewards: tuple[float, float]
@@ -195,6 +197,11 @@ class EnvCheck:
             lines.append(f"it was True at {signal.n_mid_episode} steps after which the episode went on")
         if not signal.n_counted:
             lines.append("random actions have not reached it, which is usual: exploration goes on from here")
+        if self.relabels is not None:
+            differ = "modes also learn from each episode as if the goal had been where it went"
+            lines.append(
+                f"goals differ between episodes: {differ}" if self.relabels else "all episodes learn from their own goal only"
+            )
         return lines
 
     def _of_features(self) -> list[str]:

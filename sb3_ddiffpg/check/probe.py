@@ -147,6 +147,9 @@ def _probe(
             model.learn(steps, callback=listener, reset_num_timesteps=False)
     except AssertionError as error:  # SB3's, of spaces
         raise ValueError(str(error)) from error
+    model.replay_buffer.judge_by_returns()
+    if (hindsight := model.replay_buffer.hindsight) is not None:
+        hindsight.judge(model.replay_buffer)
     by_episodes = _Walked(model, walked)
     review_scales(model)
     parting = may_choose(model) and len(model.replay_buffer.trajectories(success=True)) >= model.mode_settings.min_size
@@ -160,6 +163,7 @@ def _probe(
         limit=limit or max(listener.cut_off, default=None),
         declared_limit=limit is not None,
         success=_success(model, listener),
+        relabels=None if hindsight is None else hindsight.in_use,
         features=by_episodes.features(parting),
         cells=by_episodes.cells(caught),
         rewards=by_episodes.rewards,

@@ -1,0 +1,236 @@
+"""Other goals for transitions, against brute force; where goals could be others and where not; and what is learned by it."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from environments import small_model
+from gymnasium import spaces
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_ddiffpg import DDiffPG, check_env
+from sb3_ddiffpg.buffers.hindsight import Hindsight
+
+NEAR, GAMMA = 0.5, 0.9
+
+
+class AnyGoal(gym.Env):
+    """
+    A point in the plane, and a place to go to.
+
+    :param fixed: Whether it is always the same
+    :param extra: What the reward has beside that of the goal
+    :param dense: Whether it is the distance
+    :param latches: Whether the episode ends there
+    """
+
+    def __init__(self, fixed=False, extra=0.0, dense=False, latches=False, limit=20):
+        place = spaces.Box(-5.0, 5.0, (2,), np.float32)
+        self.observation_space = spaces.Dict(observation=place, achieved_goal=place, desired_goal=place)
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.fixed, self.extra, self.dense, self.latches, self.limit = fixed, extra, dense, latches, limit
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        distance = np.linalg.norm(achieved_goal - desired_goal, axis=-1)
+        return -distance if self.dense else -(distance > NEAR).astype(np.float32)
+
+    def _observation(self):
+        here = self.position.astype(np.float32)
+        return {"observation": here, "achieved_goal": here, "desired_goal": self.goal.astype(np.float32)}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.position, self.steps = self.np_random.uniform(-0.1, 0.1, 2), 0
+        self.goal = np.full(2, 2.0) if self.fixed else self.np_random.uniform(-3, 3, 2)
+        return self._observation(), {}
+
+    def step(self, action):
+        self.position = np.clip(self.position + 0.4 * action, -5, 5)
+        self.steps += 1
+        observation = self._observation()
+        reward = float(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})) + self.extra
+        reached = bool(np.linalg.norm(self.position - self.goal) <= NEAR)
+        return observation, reward, reached and self.latches, self.steps >= self.limit, {"is_success": reached}
+
+
+def made(n_envs=2, wrapper=lambda env: env, learning_starts=100, **kwargs):
+    env = DummyVecEnv([lambda: wrapper(AnyGoal(**kwargs))] * n_envs)
+    env.seed(0)
+    settings = {"learning_starts": learning_starts, "modes": {"distance_threshold": None}}
+    return small_model(env, "MultiInputPolicy", gamma=GAMMA, **settings)
+
+
+def with_modes(**kwargs):
+    """Goals reached by chance make a mode, which learns from all."""
+    model = made(**kwargs).learn(1000)
+    assert len(model.modes)
+    return model
+
+
+def distance(a, b):
+    return np.linalg.norm(a - b, axis=-1)
+
+
+@pytest.mark.parametrize("latches", [False, True])
+@pytest.mark.parametrize("dense", [False, True])
+def test_against_brute_force(dense, latches):
+    """Reward by reward, from the row on to where its goal is reached first, or the window ends."""
+    buffer = with_modes(dense=dense, latches=latches).replay_buffer
+    assert buffer.hindsight.in_use
+    owner = {int(row): (each.rows, place) for each in buffer.training_trajectories() for place, row in enumerate(each.rows)}
+    seen = {"own": 0, "other": 0, "ended": 0}
+    for n_steps in (1, 3, 5):
+        batch = buffer.sample_modes(500, GAMMA, 1, n_steps)
+        n = batch.rows.shape[1]
+        assert not batch.relabelled[0].any()
+        for group in range(1, len(batch.rows)):
+            for i, row in enumerate(batch.rows[group]):
+                at = group * n + i
+                told = batch.observations["desired_goal"][at].numpy()
+                np.testing.assert_array_equal(told, batch.next_observations["desired_goal"][at].numpy())
+                rows, place = owner[int(row)]
+                stored = buffer.observations["desired_goal"][row]
+                if not batch.relabelled[group, i]:
+                    np.testing.assert_array_equal(told, stored)
+                    seen["own"] += 1
+                    continue
+                seen["other"] += 1
+                reached = buffer.next_observations["achieved_goal"][rows]
+                assert (distance(reached[place:], told) == 0).any(), "a goal that was not achieved later"
+                expected, discount, ended = 0.0, 1.0, False
+                for step in range(place, min(place + n_steps, len(rows))):
+                    far = distance(reached[step], told)
+                    expected += discount * (-far if dense else -float(far > NEAR))
+                    discount *= GAMMA
+                    last = rows[step]
+                    if far == 0 if dense else far <= NEAR:
+                        ended = True
+                        break
+                seen["ended"] += ended
+                assert batch.rewards[group, i].item() == pytest.approx(expected, abs=1e-4)
+                assert batch.discounts[group, i].item() == pytest.approx(0.0 if ended else discount, rel=1e-5)
+                np.testing.assert_array_equal(
+                    batch.next_observations["observation"][at].numpy(), buffer.next_observations["observation"][last]
+                )
+                # What was done is where the ascent begins: what is stored was improved for another goal
+                np.testing.assert_array_equal(batch.target_actions[group, i].numpy(), buffer.actions[row])
+    assert all(seen.values())
+    assert seen["other"] / (seen["own"] + seen["other"]) == pytest.approx(0.8, abs=0.06)
+
+
+def test_a_goal_that_pays_is_worth_staying():
+    """As a goal of the environment's own is: r / (1 - gamma)."""
+    model = with_modes()
+    buffer = model.replay_buffer
+    buffer.hindsight.rewards = lambda achieved, desired: 2.0 * (distance(achieved, desired) <= NEAR).astype(np.float32)
+    batch = buffer.sample_modes(300, GAMMA, 1, 1)
+    other, ended = batch.relabelled, batch.discounts.numpy() == 0
+    assert (other & ended).any()
+    np.testing.assert_allclose(batch.rewards.numpy()[other & ended], 2.0 / (1 - GAMMA), rtol=1e-5)
+    np.testing.assert_allclose(batch.rewards.numpy()[other & ~ended], 0.0)
+
+
+def test_target_actions_for_other_goals_are_not_stored():
+    buffer = with_modes().replay_buffer
+    batch = buffer.sample_modes(200, GAMMA, 1, 1)
+    before = buffer.target_actions[batch.rows].copy()
+    buffer.store_target_actions(batch, batch.target_actions + 5.0)
+    other = batch.relabelled[1:]
+    own_rows = set(batch.rows[1:][~other].tolist())
+    for row, is_other, old in zip(batch.rows[1:].ravel(), other.ravel(), before[1:].reshape(-1, 2), strict=True):
+        if is_other and int(row) not in own_rows:
+            np.testing.assert_array_equal(buffer.target_actions[row], old)
+        elif not is_other:
+            assert (buffer.target_actions[row] > 3).all()
+
+
+def test_modes_learn_from_all_their_trajectories():
+    """Also from those that missed their goal long ago, and after some have left."""
+    buffer = with_modes().replay_buffer
+    trained = sum(row_set.size for row_set in buffer.mode_rows)
+    assert trained == sum(each.length for each in buffer.training_trajectories())
+    assert len([each for each in buffer.groups.retired if each.trains])
+    while len(buffer.groups.retired) > 3:
+        buffer._evict()
+    assert buffer.sample_modes(100, GAMMA, 1, 3).relabelled.any()
+
+
+@pytest.mark.parametrize("kwargs", [{"fixed": True}, {"extra": -0.1}], ids=["one goal", "other rewards"])
+def test_where_goals_cannot_be_others(kwargs):
+    """One goal for all episodes has several ways, which other goals would blur; and rewards must follow from the goals."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = made(**kwargs).learn(600)
+    buffer = model.replay_buffer
+    assert buffer.hindsight is not None and not buffer.hindsight.in_use and not buffer.learns_from_all
+    assert buffer.sample_modes(100, GAMMA, 1, 1).relabelled is None
+    told = [str(each.message) for each in caught if "compute_reward" in str(each.message)]
+    assert len(told) == ("extra" in kwargs)
+
+
+class NoGoals(gym.ObservationWrapper):
+    """The observation alone."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = env.observation_space["observation"]
+
+    def observation(self, observation):
+        return observation["observation"]
+
+
+class OneAtATime(gym.Wrapper):
+    """Its reward is computed of one goal."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return float(achieved_goal @ desired_goal)
+
+
+@pytest.mark.parametrize("wrapper", [NoGoals, OneAtATime])
+def test_environments_without_goals_that_could_be_others(wrapper):
+    env = DummyVecEnv([lambda: wrapper(AnyGoal())])
+    assert Hindsight.of(env) is None
+    assert Hindsight.of(DummyVecEnv([AnyGoal])) is not None
+
+
+def test_a_run_goes_on_as_if_it_had_not_stopped(tmp_path):
+    """What is known of the trajectories is made anew from them."""
+    model = with_modes()
+    buffer = model.replay_buffer
+    state = buffer.state_dict()
+    other = type(buffer)(
+        buffer.buffer_size, buffer.observation_space, buffer.action_space, "cpu", 2, mode_features="achieved_goal"
+    )
+    other.expect_modes(len(buffer.mode_rows))
+    other.load_state_dict(state)
+    other.claim(model.env)
+    batches = []
+    for each in (buffer, other):
+        np.random.seed(0)
+        batches.append(each.sample_modes(200, GAMMA, 1, 3))
+    np.testing.assert_array_equal(batches[0].relabelled, batches[1].relabelled)
+    np.testing.assert_array_equal(batches[0].rewards.numpy(), batches[1].rewards.numpy())
+    np.testing.assert_array_equal(batches[0].observations["desired_goal"], batches[1].observations["desired_goal"])
+
+
+@pytest.mark.parametrize(("fixed", "said"), [(False, "as if the goal had been where it went"), (True, "their own goal only")])
+def test_a_check_says_so(fixed, said):
+    assert said in str(check_env(AnyGoal(fixed), steps=200))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_any_goal_is_reached(seed):
+    """At the settings of the package. Without other goals: see the changelog."""
+    env = DummyVecEnv([lambda: gym.wrappers.TimeLimit(AnyGoal(limit=1000), 30)] * 4)
+    env.seed(seed)
+    model = DDiffPG("MultiInputPolicy", env, seed=seed, device="cpu")
+    model.set_logger(Logger(None, []))
+    model.learn(12_000)
+    tested = DummyVecEnv([lambda: gym.wrappers.TimeLimit(AnyGoal(latches=True, limit=1000), 30)])
+    tested.seed(1000)
+    _, lengths = evaluate_policy(model, tested, 50, return_episode_rewards=True)
+    assert np.mean(np.array(lengths) < 30) >= 0.9
