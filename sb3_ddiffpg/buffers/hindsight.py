@@ -10,12 +10,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ddiffpg.buffers.trajectory import Trajectory
 from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
+from sb3_ddiffpg.utils.vec_envs import has_method
 
 #: Of a mode's transitions. Four of five are those of the original's four other goals for each own one, and SB3's
 RELABELLED_SHARE = 0.8
 # Rows that are looked at to see whether goals differ and rewards follow from them, and how many of them may not
 _LOOKED_AT, _MOST_OTHERS = 256, 0.05
-ACHIEVED, DESIRED = "achieved_goal", "desired_goal"
+ACHIEVED, DESIRED, METHOD = "achieved_goal", "desired_goal", "compute_reward"
 _ACHIEVED_NEXT, _DESIRED_NEXT = f"next_observations/{ACHIEVED}", f"next_observations/{DESIRED}"
 
 
@@ -49,15 +50,17 @@ class Hindsight:
         """
         :param env: The environments
         :return: None if they have no goals that could be others
+        :raises ValueError: If their processes have died of the question
         """
         space = env.observation_space
-        if not (isinstance(space, spaces.Dict) and {ACHIEVED, DESIRED} <= set(space.spaces)):
+        if not (isinstance(space, spaces.Dict) and {ACHIEVED, DESIRED} <= set(space.spaces) and has_method(env, METHOD)):
             return None
+        made, goals = cls(env), np.stack([space[ACHIEVED].sample() for _ in range(3)])
         try:
-            made = cls(env)
-            goals = np.stack([space[ACHIEVED].sample() for _ in range(3)])
             return made if made.rewards(goals, goals).shape == (3,) else None
-        except Exception:  # whatever an environment raises that has no such method, or takes one goal at a time
+        except Exception as error:  # whatever an environment raises that takes one goal at a time
+            if hasattr(env.unwrapped, "remotes"):  # worker processes, which are of no use any more
+                raise ValueError(f"{METHOD} of the environment must take arrays of goals, [N, goal_dim]: {error}") from error
             return None
 
     def rewards(self, achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
@@ -67,7 +70,7 @@ class Hindsight:
         :return: The environment's reward for having achieved the one when the other was desired, [N]
         """
         infos: list[dict[str, Any]] = [{} for _ in achieved]
-        return np.asarray(self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0], dtype=np.float32)
+        return np.asarray(self.env.env_method(METHOD, achieved, desired, infos, indices=[0])[0], dtype=np.float32)
 
     # ------------------------------------------------------------------ what is known of the trajectories
 
@@ -87,7 +90,7 @@ class Hindsight:
         if not self.in_use and not self._warned:
             self._warned = True
             warnings.warn(
-                f"compute_reward gives other rewards than the environment in {1 - alike.mean():.0%} of its steps: episodes "
+                f"{METHOD} gives other rewards than the environment in {1 - alike.mean():.0%} of its steps: episodes "
                 "learn from their own goals only"
             )
 

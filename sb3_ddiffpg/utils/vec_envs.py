@@ -23,6 +23,18 @@ def env_attribute(env: VecEnv, name: str, default: Any = None) -> Any:
         return default
 
 
+def has_method(env: VecEnv, name: str) -> bool:
+    """
+    :param env: The environments
+    :param name: Of a method
+    :return: Whether the first environment has it; False where it cannot be asked
+    """
+    try:
+        return bool(env.has_attr(name))
+    except (AttributeError, NotImplementedError, TypeError):
+        return False
+
+
 def is_wrapped(env: VecEnv, kind: type[gym.Wrapper]) -> bool:
     """
     :param env: The environments

@@ -1,6 +1,7 @@
 """Other goals for transitions, against brute force; where goals could be others and where not; and what is learned by it."""
 
 import warnings
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -9,10 +10,11 @@ from environments import small_model
 from gymnasium import spaces
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_ddiffpg import DDiffPG, check_env
 from sb3_ddiffpg.buffers.hindsight import Hindsight
+from sb3_ddiffpg.envs.vec_env import WorkerVecEnv
 
 NEAR, GAMMA = 0.5, 0.9
 
@@ -214,6 +216,21 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(tmp_path):
     np.testing.assert_array_equal(batches[0].relabelled, batches[1].relabelled)
     np.testing.assert_array_equal(batches[0].rewards.numpy(), batches[1].rewards.numpy())
     np.testing.assert_array_equal(batches[0].observations["desired_goal"], batches[1].observations["desired_goal"])
+
+
+@pytest.mark.parametrize("kind", [WorkerVecEnv, SubprocVecEnv])
+def test_worker_processes(kind):
+    """They answer; one that died of the question says why."""
+    for wrapper, expected in ((lambda env: env, True), (NoGoals, False)):
+        env = kind([partial(_wrapped, wrapper)] * 2)
+        assert (Hindsight.of(env) is not None) == expected
+        env.close()
+    with pytest.raises(ValueError, match="compute_reward of the environment must take arrays of goals"):
+        Hindsight.of(kind([partial(_wrapped, OneAtATime)] * 2))
+
+
+def _wrapped(wrapper):
+    return wrapper(AnyGoal())
 
 
 @pytest.mark.parametrize(("fixed", "said"), [(False, "as if the goal had been where it went"), (True, "their own goal only")])

@@ -42,32 +42,27 @@ def test_learns_the_identity(length):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", range(3))
 def test_pendulum_improves_without_any_success_flag(seed):
     """
-    From about -1400 (untrained) to about -170, which is as good as it gets; the best fifth of the episodes counts as success.
+    At the settings of the package: from about -1400 (untrained) to about -170, which is as good as it gets. The best fifth of
+    the episodes counts as success.
     """
-    model = DDiffPG(
-        "MlpPolicy",
-        make_vec_env("Pendulum-v1", 4, seed=seed),
-        learning_rate=2e-3,
-        learning_starts=800,
-        batch_size=128,
-        gamma=0.95,
-        gradient_steps=4,
-        critic={"n_atoms": 1, "v_min": -40.0, "v_max": 0.0},
-        reward_scale=0.1,
-        modes={"n_steps": 1, "max_modes": 1, "min_size": 2, "max_successes": 1000, "max_failures": 1000},
-        exploration={"share": 0.1},
-        max_grad_norm=10.0,
-        policy_kwargs={"net_arch": [64, 64]},
-        seed=seed,
-    )
+    model = DDiffPG("MlpPolicy", make_vec_env("Pendulum-v1", 4, seed=seed), seed=seed)
     evaluation = make_vec_env("Pendulum-v1", 10, seed=100)
     before, _ = evaluate_policy(model, evaluation, n_eval_episodes=10)
-    model.learn(8000)
+    model.learn(16_000)
     after, _ = evaluate_policy(model, evaluation, n_eval_episodes=10)
     assert before < -900 and after > -400
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_learns_the_identity_at_the_settings_of_the_package(seed):
+    """In as many updates as steps; there is no success, no way, and nothing to set."""
+    model = DDiffPG("MlpPolicy", make_vec_env(lambda: IdentityEnvBox(eps=0.5), 1, seed=seed), seed=seed).learn(3000)
+    evaluation = make_vec_env(lambda: IdentityEnvBox(eps=0.5), 1, seed=100)
+    assert evaluate_policy(model, evaluation, n_eval_episodes=20, warn=False)[0] > 90  # of 100
 
 
 @pytest.mark.slow
