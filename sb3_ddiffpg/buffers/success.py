@@ -4,6 +4,7 @@ import math
 import warnings
 from collections import deque
 from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,8 @@ import numpy as np
 from sb3_ddiffpg.utils.vec_envs import route_label
 
 SUCCESS_KEYS = ("is_success", "success")
+# So much alike are names of which one may be a misspelling of the other
+CLOSE = 0.8
 #: Of the returns seen lately, while nobody has said what a success is
 BEST_SHARE = 0.2
 
@@ -168,13 +171,16 @@ class SuccessRule(GoalWatch):
     def check_key(self, info: dict[str, Any]) -> None:
         """
         :param info: Of an episode's last step
-        :raises ValueError: If ``success_key`` was given, no step has had it yet, and this one says it by another name
+        :raises ValueError: If ``success_key`` was given, no step has had it yet, and this one says it by another name, or by
+            one that it may be a misspelling of
         """
         if self.has_key or self.success_key is None:
             return
         complaint = f"success_key={self.success_key!r} is not in an episode's last info; its keys: {sorted(info)}"
         if any(key in info for key in SUCCESS_KEYS):
             raise ValueError(complaint)
+        if alike := get_close_matches(self.success_key, [key for key in info if isinstance(key, str)], 1, CLOSE):
+            raise ValueError(f"{complaint}; did you mean {alike[0]!r}?")
         if not self._warned:
             self._warned = True
             warnings.warn(f"{complaint}. Episodes count as failures until one has it")

@@ -20,6 +20,7 @@ class SuccessSignal:
     :param n_mid_episode: Steps at which it was True and the episode went on
     :param n_counted: Episodes that training would take for goal-reached ones
     :param stands_in: Whether these are the best of the returns, since nobody has said what a success is
+    :param asked_for: The key that was given, if no step had it
     :param candidates: Other keys of ``info`` that were True or False
     """
 
@@ -29,6 +30,7 @@ class SuccessSignal:
     n_mid_episode: int
     n_counted: int
     stands_in: bool
+    asked_for: str | None
     candidates: tuple[str, ...]
 
 
@@ -78,6 +80,7 @@ class EnvCheck:
     :param env: What was checked
     :param spaces: Of observations and actions
     :param policy: Name of the policy that they need
+    :param is_image: Whether observations are images
     :param n_steps: Random steps that were taken
     :param lengths: Of the episodes that ended
     :param limit: Steps after which an episode is cut off; None: none was seen or declared
@@ -100,6 +103,7 @@ class EnvCheck:
     env: str
     spaces: tuple[str, str]
     policy: str
+    is_image: bool
     n_steps: int
     lengths: tuple[int, ...]
     limit: int | None
@@ -147,21 +151,22 @@ class EnvCheck:
         :return: What to give where one disagrees, with values that could be, and what each is for
         """
         features, cells, success = self.features, self.cells, self.success
-        now = features.selection
-        if now is None or callable(now):
+        now, found = features.selection, {}
+        if now is None:
             now = list(range(min(2, len(features.names))))
-        elif not isinstance(now, str):
+        elif not isinstance(now, str) and not callable(now):
             now = [int(each) for each in now]
+        if not callable(now) and not self.is_image:  # of which no two numbers say where one is
+            found[f"mode_features={now!r}"] = "where modes differ: indices, or a key, of the observation"
         key = success.key or next(iter(success.candidates), "reached")
+        found[f"success_key={key!r}"] = "the key of info that tells a success"
         edge = max((each for each in cells.edges or () if math.isfinite(each)), default=0.5)
+        cell_size = f'novelty={{"kwargs": {{"cell_size": {edge:.3g}}}}}'
+        found[cell_size] = "edge of all cells, in the unit of the mode features"
         low, high = self.returns
-        high = high if high > low else low + 1.0
-        return {
-            f"mode_features={now!r}": "where modes differ: indices, or a key, of the observation",
-            f"success_key={key!r}": "the key of info that tells a success",
-            f'novelty={{"kwargs": {{"cell_size": {edge:.3g}}}}}': "edge of all cells, in the unit of the mode features",
-            f'critic={{"v_min": {low:.4g}, "v_max": {high:.4g}}}': "smallest and largest return, held fixed",
-        }
+        if success.n_counted and not success.stands_in and high > low:  # what a success is worth has been seen
+            found[f'critic={{"v_min": {low:.4g}, "v_max": {high:.4g}}}'] = "smallest and largest return, held fixed"
+        return found
 
     def _of_spaces(self) -> list[str]:
         return [f"observations {self.spaces[0]}", f"actions {self.spaces[1]}", f'policy "{self.policy}"']
@@ -170,7 +175,10 @@ class EnvCheck:
         if self.limit is not None:
             return [f"{self.limit} steps, {'as declared' if self.declared_limit else 'as seen'}"]
         if self.lengths:
-            return ["none was declared, and none was met: all episodes ended by themselves"]
+            return [
+                "none was declared, and none was met: all episodes ended by themselves",
+                "one that goes on is stored in parts; gymnasium.wrappers.TimeLimit(env, max_episode_steps=...) ends it",
+            ]
         return [
             f"none, and no episode ended in {self.n_steps} steps; an episode without end never reaches a place by a new",
             "start: put gymnasium.wrappers.TimeLimit(env, max_episode_steps=...) around each environment",
@@ -182,6 +190,8 @@ class EnvCheck:
         if signal.key is None:
             what = "until one does, the best fifth of the returns stands in for it"
             lines = [f"no step told it: {what if signal.stands_in else 'until one does, all have failed'} ({counted})"]
+            if signal.asked_for is not None:
+                lines[0] = f"no step told it by info[{signal.asked_for!r}], which was asked for: all have failed"
             if signal.candidates:
                 lines.append(f"info also has {', '.join(signal.candidates)}: if one of these is meant, give it as success_key")
             return lines
@@ -236,6 +246,8 @@ class EnvCheck:
     def _of_values(self) -> list[str]:
         returns = f"discounted returns (gamma={self.gamma:g}) {_range(self.returns)}"
         lines = [f"rewards {_range(self.rewards)}, {returns}"]
+        if self.limit is not None:
+            lines.append("an episode that the time limit ends counts as if it went on")
         if self.support is None:
             return [*lines, "nothing need be set: the critics' range follows the returns"]
         return [*lines, f"the critics hold values within {_range(self.support)}, as given"]

@@ -4,7 +4,8 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_ddiffpg.buffers.feature_choice import travels
 from sb3_ddiffpg.buffers.features import ModeFeatures, declared_mode_features
+from sb3_ddiffpg.buffers.hindsight import METHOD
 from sb3_ddiffpg.buffers.returns import discounted_returns
 from sb3_ddiffpg.buffers.success import SUCCESS_KEYS, GoalWatch, read_success
 from sb3_ddiffpg.check.findings import Cells, ChosenFeatures, EnvCheck, SuccessSignal
@@ -158,6 +160,7 @@ def _probe(
         env=_name(given),
         spaces=(_text(model.observation_space), _text(model.action_space)),
         policy=policy if isinstance(policy, str) else policy.__name__,
+        is_image=is_image_space(model.observation_space),
         n_steps=by_episodes.n_steps,
         lengths=(*listener.lengths, *listener.cut_off),
         limit=limit or max(listener.cut_off, default=None),
@@ -174,7 +177,7 @@ def _probe(
         labels=dict(listener.labels),
         wrappers=tuple(_changing_wrappers(walked)),
         warned=tuple(_warned(caught, given, env, env_kwargs)),
-        code=_code(given, policy, env_kwargs, arguments),
+        code=_code(given, policy, env_kwargs, arguments, model.replay_buffer.success_rule.has_key),
     )
 
 
@@ -267,6 +270,7 @@ def _success(model: DDiffPG, listener: _Listener) -> SuccessSignal:
         n_steps=said,
         n_mid_episode=0 if rule_key is None else listener.mid_episode[rule_key],
         n_counted=len(model.replay_buffer.trajectories(success=True)),
+        asked_for=None if rule_key is not None else model.success_key,
         stands_in=not model.replay_buffer.has_success_signal and model.success_key is None,
         candidates=tuple(listener.candidates),
     )
@@ -338,9 +342,9 @@ def _text(space: spaces.Space) -> str:
     if not isinstance(space, spaces.Box):
         return str(space)
     low, high = float(np.min(space.low)), float(np.max(space.high))
-    return f"{tuple(map(int, space.shape))} numbers in [{low:.4g}, {high:.4g}]" + (
-        " (an image)" if is_image_space(space) else ""
-    )
+    alike = (space.low == low).all() and (space.high == high).all()
+    kind = " (an image)" if is_image_space(space) else "" if alike else " (the widest of different ranges)"
+    return f"{tuple(map(int, space.shape))} numbers in [{low:.4g}, {high:.4g}]{kind}"
 
 
 def _warned(caught: list[warnings.WarningMessage], given: Any, env: Any, env_kwargs: dict[str, Any]) -> Iterator[str]:
@@ -350,9 +354,12 @@ def _warned(caught: list[warnings.WarningMessage], given: Any, env: Any, env_kwa
     single = gym.make(given, **env_kwargs) if isinstance(given, str) else env
     if isinstance(single, gym.Env):
         try:
-            check_by_sb3(single, skip_render_check=True)
-        except Exception as error:  # of whatever it calls: it asks goal environments behind wrappers what these do not know
-            texts.append(f"SB3's env_checker: {error}")
+            with redirect_stdout(StringIO()):  # it says that it takes it for a goal environment
+                check_by_sb3(single, skip_render_check=True)
+        except Exception as error:  # of whatever it calls
+            # It asks goal environments behind wrappers what these do not know
+            if not (isinstance(error, AttributeError) and METHOD in str(error)):
+                texts.append(f"SB3's env_checker: {error}")
         finally:
             if single is not env:
                 single.close()
@@ -366,8 +373,12 @@ def _matters(warning: warnings.WarningMessage) -> bool:
     return not issubclass(warning.category, silent) and "render_mode='rgb_array'" not in str(warning.message)
 
 
-def _code(given: Any, policy: Any, env_kwargs: dict[str, Any], arguments: dict[str, Any]) -> str:
-    """Lines that train, as they can be run; an environment that is made already is called ``env`` in them."""
+def _code(given: Any, policy: Any, env_kwargs: dict[str, Any], arguments: dict[str, Any], has_key: bool) -> str:
+    """
+    Lines that train, as they can be run; an environment that is made already is called ``env`` in them. A key that no step
+    had is left out.
+    """
+    arguments = {name: value for name, value in arguments.items() if name != "success_key" or has_key}
     more = "".join(f", {name}={value!r}" for name, value in arguments.items())
     named = f'"{policy}"' if isinstance(policy, str) else policy.__name__
     lines = ["from sb3_ddiffpg import DDiffPG"]

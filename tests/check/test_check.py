@@ -315,3 +315,53 @@ def test_from_a_checkout():
     command = [sys.executable, "-m", "sb3_ddiffpg.check", "CartPole-v1", "--steps", "50"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1 and "CartPole-v1 cannot be trained on" in done.stderr and not done.stdout
+
+
+# ---------------------------------------------------------------------- what a stranger would paste
+
+
+def test_values_are_suggested_only_where_a_success_has_shown_its_worth():
+    """Before that the largest return that was met would cut off all that is to come."""
+    reached = check(Script(lambda t, e: {"is_success": t == LENGTH}, lambda t, e: -1.0 + 5.0 * (t == LENGTH)))
+    missed = check(Script(lambda t, e: {"is_success": False}, lambda t, e: -1.0))
+    told = [[each for each in found.arguments() if each.startswith("critic")] for found in (reached, missed)]
+    assert len(told[0]) == 1 and told[1] == []
+
+
+def test_a_misspelt_key_is_not_handed_on():
+    env = Script(lambda t, e: {"reached": False, "TimeLimit.truncated": False})
+    with pytest.raises(ValueError, match="success_key='reachd' is not in .*did you mean 'reached'"):
+        check(env, success_key="reachd")
+    other = check(env, success_key="solved")
+    assert "info['solved'], which was asked for" in str(other) and "info also has reached" in str(other)
+    assert "solved" not in other.code and "success_key='reached'" in other.arguments()
+    kept = check(Script(lambda t, e: {"reached": False}), success_key="reached")
+    assert "success_key='reached'" in kept.code
+
+
+def test_no_two_pixels_are_suggested():
+    image = spaces.Box(0, 255, (36, 36, 3), np.uint8)
+    assert not any(each.startswith("mode_features") for each in check(AnySpaces(image), steps=50).arguments())
+
+
+def test_ranges_of_several_components():
+    different = AnySpaces(spaces.Box(np.array([-1, -5], np.float32), np.array([1, 5], np.float32)))
+    assert "(2,) numbers in [-5, 5] (the widest of different ranges)" in str(check(different, steps=50))
+
+
+class Reward(GoalEnv):
+    """A goal environment as one should be."""
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -np.linalg.norm(np.asarray(achieved_goal) - desired_goal, axis=-1)
+
+
+def test_a_goal_environment_behind_a_time_limit_is_not_complained_of(capsys):
+    """SB3's checker asks the outermost wrapper, which does not know."""
+    name = "CheckedGoal-v0"
+    gym.register(name, Reward, max_episode_steps=20)
+    try:
+        assert not any("env_checker" in each for each in check(name, steps=50).warned)
+        assert "GoalEnv" not in capsys.readouterr().out
+    finally:
+        gym.registry.pop(name)
