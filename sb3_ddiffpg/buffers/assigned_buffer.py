@@ -89,9 +89,14 @@ class AssignedReplayBuffer(PathReplayBuffer):
             self.hindsight.judge(self)
 
     @property
+    def has_hindsight(self) -> bool:
+        """Whether a mode learns from goals that were reached in place of others."""
+        return self.hindsight is not None and self.hindsight.in_use
+
+    @property
     def learns_from_all(self) -> bool:
         """Whether a mode learns from all its episodes: where it is told at each step how well it does, or afterwards."""
-        return not self.has_success_signal or (self.hindsight is not None and self.hindsight.in_use)
+        return not self.has_success_signal or self.has_hindsight
 
     def training_trajectories(self) -> list[Trajectory]:
         """

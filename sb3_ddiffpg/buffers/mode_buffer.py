@@ -129,7 +129,7 @@ class ModeReplayBuffer(AssignedReplayBuffer):
         notes = self.notes.take(windows)
         goals_are_told: Any = self.has_success_signal
         relabelling = None
-        if self.hindsight is not None and self.hindsight.in_use and n_groups > 1:
+        if self.hindsight is not None and self.has_hindsight and n_groups > 1:
             relabelling = self.hindsight.relabel(self, rows, windows, notes)
         if relabelling is not None:
             goals_are_told = goals_are_told | relabelling.chosen[..., None]

@@ -87,7 +87,9 @@ def find_modes(
     successes = [trajectory for trajectory in found if trajectory.mode not in retired]
     distances = np.zeros((len(successes), len(successes)), dtype=np.float32)
     labels = np.full(len(successes), NO_MODE)
-    if len(successes) >= (settings.min_size if buffer.has_success_signal else 1):
+    if not modes and not successes and buffer.has_hindsight:
+        return _before_any_success(failures, abandoned)
+    if len(successes) >= (1 if buffer.learns_from_all else settings.min_size):
         distances = buffer.success_distances(successes)
         labels = cluster(distances)
 
@@ -149,6 +151,17 @@ def readmit_homeless(buffer: ModeReplayBuffer, numbers: set[int]) -> None:
         buffer.readmit(trajectory)
 
 
+def _before_any_success(failures: list[Trajectory], abandoned: list[Trajectory]) -> Reclustering:
+    """One mode of all failures, if there are any: they have all reached some goal, if not the one that was meant."""
+    matching = ModeMatching(parents=[None], kept=[False], merged={}, retired=[])
+    labels, distances = np.zeros(0, dtype=int), np.zeros((0, 0), dtype=np.float32)
+    if not failures:
+        matching = ModeMatching(parents=[], kept=[], merged={}, retired=[])
+    return Reclustering(
+        [], labels, distances, failures, np.zeros(len(failures), dtype=int), abandoned, matching, counters=[], off_mode=[]
+    )
+
+
 def _count(labels: np.ndarray) -> int:
     return int(labels.max(initial=NO_MODE)) + 1
 
@@ -175,7 +188,9 @@ def _share_out(
     """New mode of every failure. A mode must see its own; those of nobody are shared out by likeness, as in the paper."""
     failure_labels = np.array([_assigned(heirs, failure) for failure in failures], dtype=int)
     strayed = np.flatnonzero([failure.assigned_mode not in heirs and not failure.off_mode_success for failure in failures])
-    if _count(labels) and len(strayed):
+    if not _count(labels) and len(heirs) == 1 and buffer.has_hindsight:
+        failure_labels[strayed] = next(iter(heirs.values()))
+    elif _count(labels) and len(strayed):
         members = [[buffer.path(successes[i]) for i in np.flatnonzero(labels == mode)] for mode in range(_count(labels))]
         failure_labels[strayed] = assign_to_nearest([buffer.path(failures[i]) for i in strayed], members, rng)
     return failure_labels
@@ -297,6 +312,8 @@ def _old_labels(
         members = [[buffer.resample(modes[mode].representative)] for mode in known]
         nearest = assign_to_nearest([buffer.path(successes[i]) for i in unowned], members, rng, n_samples=1)
         labels[unowned] = [mode if mode in dormant else NO_MODE for mode in np.asarray(known)[nearest].tolist()]
+    elif len(modes) == 1 and not known and buffer.has_hindsight:
+        labels[unowned] = 0  # the first successes of a mode that began without
     return labels
 
 

@@ -62,6 +62,7 @@ class ModeManager:
         self.next_number = 0
         #: Whether the environment itself has said what a success is
         self.success_is_told = False
+        self._has_outliers = True
 
     def __len__(self) -> int:
         return len(self.modes)
@@ -100,6 +101,7 @@ class ModeManager:
         :return: What happened: births, splits, merges and retirements
         """
         self.success_is_told = buffer.has_success_signal
+        self._has_outliers = not buffer.learns_from_all
         if self.success_is_told:
             retired = retired_modes(self.modes, self.settings.trials)
         else:
@@ -131,8 +133,8 @@ class ModeManager:
         if settings.max_modes == 1:
             return np.zeros(len(distances), dtype=int)  # clustering off: whatever reaches the goal is the one mode
         labels = cluster(distances, settings.distance_threshold, settings.linkage, settings.max_modes, settings.min_size)
-        # The best so far is always a way to begin with, as single and unlike the others as it may be; a goal is not
-        return labels if self.success_is_told else without_outliers(labels, distances)
+        # Where one learns from all, the best so far is a way to begin with, as single and unlike the others as it may be
+        return labels if self._has_outliers else without_outliers(labels, distances)
 
     def hold(self, modes: list[Mode], buffer: ModeReplayBuffer, followers: Followers) -> None:
         """

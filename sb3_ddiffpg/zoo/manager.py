@@ -85,7 +85,7 @@ class ModeExperimentManager(ExperimentManager):
             own: Any = ALGOS[self.algo]
             settings = {"verbose": self.verbose, "tensorboard_log": self.tensorboard_log, "device": self.device}
             resumed: BaseAlgorithm = own.resume(self.resume / "checkpoints", env, **settings)
-            print(f"Going on at step {resumed.num_timesteps} of {self.n_timesteps}")
+            print(f"Going on at step {resumed.num_timesteps} of {self.n_timesteps}, with the random numbers of then")
             return resumed
         model = super()._load_pretrained_agent(hyperparams, env)
         # The zoo counts steps from zero again; with a full buffer the random warm-up would only do harm

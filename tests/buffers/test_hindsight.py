@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from environments import small_model
 from gymnasium import spaces
+from planar import belongings, same
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
@@ -216,6 +217,35 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(tmp_path):
     np.testing.assert_array_equal(batches[0].relabelled, batches[1].relabelled)
     np.testing.assert_array_equal(batches[0].rewards.numpy(), batches[1].rewards.numpy())
     np.testing.assert_array_equal(batches[0].observations["desired_goal"], batches[1].observations["desired_goal"])
+
+
+class FarGoal(AnyGoal):
+    """Out of reach."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.goal = self.goal + 50.0
+        return self._observation(), {}
+
+
+def test_a_mode_begins_before_any_success():
+    """All have reached some goal; what succeeds later is of the same mode, and of one route or not learned with the rest."""
+    env = DummyVecEnv([FarGoal] * 2)
+    env.seed(0)
+    model = small_model(env, "MultiInputPolicy", learning_starts=100, modes={"distance_threshold": None}).learn(600)
+    (mode,) = model.modes
+    buffer = model.replay_buffer
+    assert mode.n_trajectories == 0 and not buffer.trajectories(success=True)
+    finished = [*buffer.trajectories(success=False), *buffer.groups.retired]
+    assert len(finished) > 25 and sum(each.trains for each in finished) >= len(finished) - 4
+    assert model.replay_buffer.sample_modes(64, GAMMA, 1, 1).relabelled[1].any()
+    critics = belongings(model)[mode.name]
+    # Now it is within reach of some; no re-clustering but this one
+    latest = {each.serial for each in buffer.trajectories(success=False)[-3:]}
+    buffer.groups.judge_again(lambda trajectory: trajectory.serial in latest)
+    model.recluster()
+    assert [(each.number, each.n_trajectories) for each in model.modes] == [(mode.number, 3)]
+    assert same(critics, belongings(model)[mode.name])
 
 
 @pytest.mark.parametrize("kind", [WorkerVecEnv, SubprocVecEnv])

@@ -141,7 +141,7 @@ def test_a_trial_of_it(run, named, tmp_path):
 
 
 def test_a_trial_without_an_entry_takes_the_default():
-    assert hyperparameters("ddiffpg", WITH_MODULE, None) == {"policy": "DiffusionPolicy", "n_timesteps": 3e5}
+    assert hyperparameters("ddiffpg", WITH_MODULE, None) == {"policy": "DiffusionPolicy", "n_timesteps": 3e5, "n_envs": 8}
 
 
 @pytest.mark.parametrize("env", [None, WITH_MODULE])
