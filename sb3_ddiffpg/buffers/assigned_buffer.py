@@ -72,7 +72,7 @@ class AssignedReplayBuffer(PathReplayBuffer):
         self.mode_rows: list[RowSet] = []
         #: Of trajectories that reached a goal by a route of which a mode has not its fill
         self.new_route_rows = np.empty(0, dtype=np.int32)
-        #: Indices of modes that came of successes which were taken back; they end with the next clustering
+        #: Indices of modes that came of successes which were taken back; they end when others are found, and not they
         self.unfounded_modes: set[int] = set()
         #: Other goals than the given ones; None: there are none
         self.hindsight: Hindsight | None = None
@@ -94,9 +94,14 @@ class AssignedReplayBuffer(PathReplayBuffer):
         return self.hindsight is not None and self.hindsight.in_use
 
     @property
+    def has_outliers(self) -> bool:
+        """Whether a success may be of no mode: where it has been told what one is, but not where all reach something."""
+        return self.has_success_signal and not self.has_hindsight
+
+    @property
     def learns_from_all(self) -> bool:
         """Whether a mode learns from all its episodes: where it is told at each step how well it does, or afterwards."""
-        return not self.has_success_signal or self.has_hindsight
+        return not self.has_outliers or bool(self.unfounded_modes)
 
     def training_trajectories(self) -> list[Trajectory]:
         """

@@ -47,6 +47,13 @@ class Reclustering:
     counters: list[Counters]
     off_mode: list[tuple[Trajectory, list[Trajectory]]]
 
+    def continued(self) -> list[int | None]:
+        """
+        :return: For each cluster the index of the old mode that goes on in it, None if it is a new one
+        """
+        parents, kept = self.matching.parents, self.matching.kept
+        return [parents[new] if kept[new] else None for new in range(_count(self.labels))]
+
     def describe(self, modes: Sequence[Mode], buffer: ModeReplayBuffer) -> None:
         """
         Bring the modes' statistics up to date, after the trajectories were handed over.
@@ -89,7 +96,7 @@ def find_modes(
     labels = np.full(len(successes), NO_MODE)
     if not modes and not successes and buffer.has_hindsight:
         return _before_any_success(failures, abandoned)
-    if len(successes) >= (1 if buffer.learns_from_all else settings.min_size):
+    if len(successes) >= (settings.min_size if buffer.has_outliers else 1):
         distances = buffer.success_distances(successes)
         labels = cluster(distances)
 

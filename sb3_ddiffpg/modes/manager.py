@@ -101,17 +101,19 @@ class ModeManager:
         :return: What happened: births, splits, merges and retirements
         """
         self.success_is_told = buffer.has_success_signal
-        self._has_outliers = not buffer.learns_from_all
+        self._has_outliers = buffer.has_outliers
         if self.success_is_told:
             retired = retired_modes(self.modes, self.settings.trials)
         else:
             buffer.judge_by_returns()
             retired = surpassed_modes(self.modes, self.settings.min_size, buffer)
-        # Those of successes that were none, unless the user keeps them
-        unfounded = {index for index in buffer.unfounded_modes if not self.modes[index].frozen}
-        buffer.unfounded_modes, retired = set(), sorted({*retired, *unfounded})
         readmit_homeless(buffer, {mode.number for index, mode in enumerate(self.modes) if index not in retired})
         found = find_modes(buffer, self.modes, self._cluster, self.settings, births, retired)
+        if buffer.unfounded_modes and len(found.successes) >= self.settings.min_size and len(founded := found.continued()):
+            # Now successes make modes: one of what was none ends if none of these is its own, unless the user keeps it
+            ended = {index for index in buffer.unfounded_modes if index not in founded and not self.modes[index].frozen}
+            buffer.unfounded_modes = set()
+            found = find_modes(buffer, self.modes, self._cluster, self.settings, births, sorted({*retired, *ended}))
         # What was found is carried out: counters, off-mode successes, trajectories, networks, records
         for mode, counters in zip(self.modes, found.counters, strict=True):
             mode.doubts, mode.misses, mode.unjudged = counters.doubts, counters.misses, 0

@@ -334,3 +334,24 @@ def test_a_mode_that_the_best_have_left_behind_ends():
     last.misses = 10 * SETTINGS.min_size
     dense(alone, *[20.0] * 30, route="right")
     assert alone.recluster() == [] and route_of(last) == "right"
+
+
+def test_what_was_learned_before_the_first_success_is_not_lost():
+    """Modes of the best returns wait until successes make a mode: the one that these are nearest to is it, the others end."""
+    alone = Alone()
+    dense(alone, *[9.0] * 5)
+    dense(alone, *[9.0] * 5, route="down")
+    dense(alone, *[1.0] * 50, route="right")
+    alone.recluster()
+    by_route = {route_of(mode): mode for mode in alone.manager.modes}
+    assert by_route.keys() == {"up", "down"}
+    alone.walk("down", SETTINGS.min_size - 1)
+    assert alone.buffer.has_success_signal and len(alone.buffer.unfounded_modes) == 2
+    assert alone.recluster() == []
+    assert len(alone.manager) == 2 and alone.buffer.learns_from_all
+    trained = [row_set.size for row_set in alone.buffer.mode_rows]
+    assert min(trained) > 0
+    alone.walk("down", 1)
+    assert alone.recluster() == [f"{by_route['up'].name} retired"]
+    assert alone.manager.modes == [by_route["down"]] and by_route["down"].n_trajectories == SETTINGS.min_size
+    assert not alone.buffer.unfounded_modes and not alone.buffer.learns_from_all
