@@ -102,6 +102,7 @@ class ModeReplayBuffer(AssignedReplayBuffer):
         env: VecNormalize | None = None,
         exploration_gamma: float | None = None,
         visits_of_modes: bool = False,
+        lost_value: float = 0.0,
     ) -> ModeBatch:
         """
         Draw one multimodal batch: an equal part from all transitions (exploratory group) and from each mode's own.
@@ -113,6 +114,7 @@ class ModeReplayBuffer(AssignedReplayBuffer):
         :param env: Normalises observations and rewards when given
         :param exploration_gamma: The exploratory group's discount factor; None: gamma
         :param visits_of_modes: Whether ``visited`` is of all groups, or of the exploratory one alone
+        :param lost_value: What it is worth to a mode to leave its route
         :return: The batch
         """
         n_groups = len(self.mode_rows) + 1
@@ -144,6 +146,7 @@ class ModeReplayBuffer(AssignedReplayBuffer):
             explore_beyond_goals=self.explore_beyond_goals,
             new_routes_pay=self.new_route_share > 0,
             goals_are_told=goals_are_told,
+            lost_value=lost_value,
         )
         # What led away from the route is for the critic to judge, not for the policy to follow
         imitated = active[:, None] & ~notes["off_mode_success"][..., 0]

@@ -31,7 +31,8 @@ def group_returns(
     gammas: np.ndarray,
     explore_beyond_goals: bool,
     new_routes_pay: bool,
-    goals_are_told: bool = True,
+    goals_are_told: bool | np.ndarray = True,
+    lost_value: float = 0.0,
 ) -> GroupReturns:
     """
     :param windows: Rows from each transition on, -1 where they end, [G, n, n_steps]; the exploratory group first
@@ -40,12 +41,14 @@ def group_returns(
     :param gammas: Discount factor of each group, [G]
     :param explore_beyond_goals: Whether a goal does not end the exploratory group's returns
     :param new_routes_pay: Whether that group is paid for goals by new routes
-    :param goals_are_told: Whether goals are the environment's, and not the ends of the best episodes
+    :param goals_are_told: Whether goals are the environment's, and not the ends of the best episodes, perhaps of each step
+    :param lost_value: What it is worth to leave the mode's route
     :return: The returns
     """
     present = windows >= 0
     gammas = gammas.astype(np.float32)[:, None]
-    # For its mode a step off the route ends the episode without reward, so that no way back is worth anything
+    # For its mode a step off the route ends the episode, so that no way back is worth anything. What it is worth to have left
+    # it must be no more than to fail: where each step costs, 0 would be the best of all
     lost = np.logical_or.accumulate(notes["off_route"] & present, axis=-1)
     lost[EXPLORATORY_GROUP] = False
     powers = gammas[..., None] ** np.arange(windows.shape[-1], dtype=np.float32)
@@ -66,7 +69,7 @@ def group_returns(
         # Any other that ended it would be the one place that explorers keep away from
         terminates[EXPLORATORY_GROUP] &= ~(notes["goals"] & ~paid)[EXPLORATORY_GROUP]
 
-    rewards = np.where(present & ~lost, rewards, 0.0) * powers
+    rewards = np.where(present & ~lost, rewards, np.where(lost.cumsum(axis=-1) == 1, lost_value, 0.0)) * powers
     lengths = present.sum(axis=-1)
     ends = lengths[..., None] - 1
     ended = np.take_along_axis(terminates | reached, ends, axis=-1)[..., 0]

@@ -194,16 +194,14 @@ class CollectingAlgorithm(SavableAlgorithm):
         :param record: Of a step, with the episodes that it has ended, perhaps none, and parts of those that go on
         """
         for _, trajectory in (*record.parts, *record.finished):
-            if self._warned_support and not self.value_range.adapts:
-                return
             buffer, last = self.replay_buffer, trajectory.rows[-1]
             rewards = self.reward_scale * buffer.training_rewards(trajectory.rows, self._vec_normalize_env)
             goes_on = bool(buffer.timeouts[last] or not buffer.dones[last])
             at_goal = bool(buffer.goals[last]) and buffer.has_success_signal
             then = "ends" if not goes_on else "stays" if at_goal else "goes on"
             returns = discounted_returns(rewards, self.gamma, then)
-            if self.value_range.adapts:
-                self.value_range.observe(returns)
+            self.value_range.observe(returns)
+            if self.value_range.adapts or self._warned_support:
                 continue
             low, high = self.critic_settings.support
             if returns.max() > high + 1e-6 or returns.min() < low - 1e-6:

@@ -293,6 +293,7 @@ class DDiffPG(ActorCriticAlgorithm):
                     env=self._vec_normalize_env,
                     exploration_gamma=self.exploration_settings.gamma,
                     visits_of_modes=self.mode_settings.novelty_coef != 0.0,
+                    lost_value=self.value_range.worst / self.reward_scale,
                 )
                 # Novelty is what explorers are paid, the environment's reward what the modes are
                 batch = self.bonus.end_past_routes(batch)

@@ -31,7 +31,7 @@ class ValueRange:
 
     The idea is that of PopArt (van Hasselt et al., 2016) and of scaling rewards by the returns (Lee et al., 2025).
 
-    :param adapts: False: values are what they are, and the other methods change nothing
+    :param adapts: False: values are what they are; which were met is noted all the same
     :param novelty_unit: First value of novelty that is 1
     :param most_novelty: The largest value that novelty can have
     """
@@ -46,9 +46,14 @@ class ValueRange:
     @property
     def unit(self) -> float:
         """What a value of 1 is more than one of 0; 1 while all returns were the same."""
-        if self.low is None or self.high is None or not self.high > self.low:
+        if not self.adapts or self.low is None or self.high is None or not self.high > self.low:
             return 1.0
         return self.high - self.low
+
+    @property
+    def worst(self) -> float:
+        """The smallest return that was met, 0 if none was below: what it is worth to fail for good."""
+        return min(0.0, self.low or 0.0)
 
     @property
     def grows(self) -> bool:
@@ -59,8 +64,6 @@ class ValueRange:
         """
         :param returns: Discounted, from steps of an episode that has ended, shape [length]
         """
-        if not self.adapts:
-            return
         low, high = float(returns.min()), float(returns.max())
         self.low = low if self.low is None else min(low, self.low)
         self.high = high if self.high is None else max(high, self.high)

@@ -141,10 +141,10 @@ class PlainBuffer:
         limit = max(1.5 * lengths[0], lengths[:5][-1])
         return [episode for episode in episodes if len(episode["steps"]) <= limit]
 
-    def window(self, number, n_steps, for_mode, gamma=GAMMA):
+    def window(self, number, n_steps, for_mode, gamma=GAMMA, lost_value=0.0):
         """
         n-step reward, discount and the last step of the window that begins with a step. For a mode, a step off its route is
-        the end, without reward, and a goal the end too, at which one stays for ever where the environment does not end the
+        the end, worth what it is worth to be lost, and a goal the end too, at which one stays for ever where the environment does not end the
         episode and pays; for exploration a goal that ends it is none if it shall go on beyond.
         """
         episodes = [e["steps"] for e in self.episodes] + self.running
@@ -152,7 +152,8 @@ class PlainBuffer:
         first = next(i for i, step in enumerate(steps) if step["number"] == number)
         reward, discount, lost = 0.0, 1.0, False
         for last in steps[first : first + n_steps]:
-            lost = lost or (for_mode and last["off_route"])
+            if for_mode and last["off_route"] and not lost:
+                lost, reward = True, reward + discount * lost_value
             terminated, goal = (
                 last["done"] and not last["timeout"],
                 last["goal"] and all(steps is not each for each in self.running),
@@ -262,11 +263,13 @@ class BufferMachine(RuleBasedStateMachine):
         exploration=st.integers(1, 3),
         mode=st.integers(1, 5),
         exploration_gamma=st.sampled_from([None, 0.5]),
+        lost=st.sampled_from([0.0, -7.0]),
     )
-    def improve(self, batch_size, exploration, mode, exploration_gamma):
+    def improve(self, batch_size, exploration, mode, exploration_gamma, lost):
         if not self.number or not self.buffer.size():
             return
-        batch = self.buffer.sample_modes(batch_size, GAMMA, exploration, mode, exploration_gamma=exploration_gamma)
+        gammas = {"exploration_gamma": exploration_gamma}
+        batch = self.buffer.sample_modes(batch_size, GAMMA, exploration, mode, **gammas, lost_value=lost)
         n = batch_size // (self.plain.n_modes + 1)
         assert batch.rows.shape == (self.plain.n_modes + 1, n)
         numbers = batch.observations[:, 0].numpy().astype(int).reshape(batch.rows.shape)
@@ -280,7 +283,7 @@ class BufferMachine(RuleBasedStateMachine):
             if group > 0 and batch.active[group]:
                 assert owner[number] == group - 1
             gamma = GAMMA if group else exploration_gamma or GAMMA
-            reward, discount, last = self.plain.window(number, mode if group else exploration, group > 0, gamma)
+            reward, discount, last = self.plain.window(number, mode if group else exploration, group > 0, gamma, lost)
             assert batch.rewards[group, column].item() == pytest.approx(reward, rel=1e-4, abs=1e-5)
             assert batch.discounts[group, column].item() == pytest.approx(discount, rel=1e-5)
             np.testing.assert_array_equal(next_obs[group, column], last["next_obs"])
