@@ -144,8 +144,8 @@ class PlainBuffer:
     def window(self, number, n_steps, for_mode, gamma=GAMMA, lost_value=0.0):
         """
         n-step reward, discount and the last step of the window that begins with a step. For a mode, a step off its route is
-        the end, worth what it is worth to be lost, and a goal the end too, at which one stays for ever where the environment does not end the
-        episode and pays; for exploration a goal that ends it is none if it shall go on beyond.
+        the end, worth what it is worth to be lost, and a goal the end too, at which one stays for ever where the environment
+        does not end the episode and pays; for exploration a goal that ends it is none if it shall go on beyond.
         """
         episodes = [e["steps"] for e in self.episodes] + self.running
         steps = next(e for e in episodes if any(step["number"] == number for step in e))
