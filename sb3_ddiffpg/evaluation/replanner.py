@@ -4,12 +4,19 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space, maybe_transpose
 from stable_baselines3.common.utils import is_vectorized_observation
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.buffers.features import ModeFeatures
 
 Observation = np.ndarray | dict[str, np.ndarray]
+
+
+def _as_stored(observation: Any, space: spaces.Space) -> Any:
+    """Images of an environment by itself have their channels last, those of a model's first."""
+    return maybe_transpose(np.asarray(observation), space) if is_image_space(space) else observation
 
 
 class Replanner:
@@ -126,7 +133,12 @@ class Replanner:
         return actions[0] if is_single else actions, (rank, anchor, still, failed)
 
     def _as_batch(self, observation: Any) -> tuple[Any, bool]:
-        if is_vectorized_observation(observation, self.model.observation_space):
+        space = self.model.observation_space
+        if isinstance(observation, dict):
+            observation = {key: _as_stored(value, space[key]) for key, value in observation.items()}
+        else:
+            observation = _as_stored(observation, space)
+        if is_vectorized_observation(observation, space):
             return observation, False
         if isinstance(observation, dict):
             return {key: np.asarray(value)[None] for key, value in observation.items()}, True

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecTran
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES
+from sb3_ddiffpg.evaluation import Replanner
 
 IMAGES = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 8}}
 
@@ -92,3 +93,17 @@ def test_scaled_images_are_taken_as_they_are():
     env = AnySpaces(spaces.Box(-1.0, 1.0, (1, 36, 36)))
     model = seeing(DDiffPG, env, policy_kwargs={**IMAGES, **kwargs}, train_freq=8, **WIDE).learn(64)
     assert model.replay_buffer.observations.dtype == np.float32
+
+
+def test_a_replanner_sees_images_of_either_order():
+    """An environment by itself has the channels last; one that is asked through ``model.env`` has them first."""
+    env = image_env()
+    model = seeing(DDiffPG, env)
+    model.policy.resize(1)
+    model.mode_manager.expect_unknown(1, 0, model.replay_buffer, model.scheduler)
+    agent = Replanner(model, patience=5, tolerance=1.0, order=["mode_0"])
+    image = env.observation_space.sample()
+    expected = model.predict(image, mode="mode_0", deterministic=True)[0]
+    for given in (image, image.transpose(2, 0, 1)):
+        np.testing.assert_array_equal(agent.predict(given, deterministic=True)[0], expected)
+    np.testing.assert_array_equal(agent.predict(image[None], deterministic=True)[0], expected[None])
