@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ddiffpg.buffers.trajectory import Trajectory
 from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
-from sb3_ddiffpg.utils.vec_envs import has_method
+from sb3_ddiffpg.utils.vec_envs import ask_first, has_method
 
 #: Of a mode's transitions. Four of five are those of the original's four other goals for each own one, and SB3's
 RELABELLED_SHARE = 0.8
@@ -70,7 +70,7 @@ class Hindsight:
         :return: The environment's reward for having achieved the one when the other was desired, [N]
         """
         infos: list[dict[str, Any]] = [{} for _ in achieved]
-        return np.asarray(self.env.env_method(METHOD, achieved, desired, infos, indices=[0])[0], dtype=np.float32)
+        return np.asarray(ask_first(self.env, METHOD, achieved, desired, infos), dtype=np.float32)
 
     # ------------------------------------------------------------------ what is known of the trajectories
 

@@ -186,7 +186,7 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
         # the goal, see ``common.scales``
         self.next_review, self.features_found, self.features_settled = 0, False, False
         #: The unit of the values that the critics learn
-        self.value_range = ValueRange(adapts=False)
+        self.value_range = ValueRange(adapts=False, notes=False)
 
         if _init_setup_model:
             self._setup_model()

@@ -32,12 +32,15 @@ class ValueRange:
     The idea is that of PopArt (van Hasselt et al., 2016) and of scaling rewards by the returns (Lee et al., 2025).
 
     :param adapts: False: values are what they are; which were met is noted all the same
+    :param notes: False: it is not
     :param novelty_unit: First value of novelty that is 1
     :param most_novelty: The largest value that novelty can have
     """
 
-    def __init__(self, adapts: bool, novelty_unit: float = 1.0, most_novelty: float = float("inf")) -> None:
-        self.adapts, self.most_novelty = adapts, most_novelty
+    def __init__(
+        self, adapts: bool, novelty_unit: float = 1.0, most_novelty: float = float("inf"), notes: bool = True
+    ) -> None:
+        self.adapts, self.notes, self.most_novelty = adapts, notes, most_novelty
         self.novelty_unit = min(novelty_unit, most_novelty)
         self.low: float | None = None
         self.high: float | None = None
@@ -64,6 +67,8 @@ class ValueRange:
         """
         :param returns: Discounted, from steps of an episode that has ended, shape [length]
         """
+        if not self.notes:
+            return
         low, high = float(returns.min()), float(returns.max())
         self.low = low if self.low is None else min(low, self.low)
         self.high = high if self.high is None else max(high, self.high)

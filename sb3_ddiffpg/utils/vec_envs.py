@@ -35,6 +35,16 @@ def has_method(env: VecEnv, name: str) -> bool:
         return False
 
 
+def ask_first(env: VecEnv, method: str, *arguments: Any) -> Any:
+    """
+    :param env: The environments
+    :param method: That they have, see ``has_method``
+    :param arguments: Of it
+    :return: What the first environment answers
+    """
+    return env.env_method(method, *arguments, indices=[0])[0]
+
+
 def is_wrapped(env: VecEnv, kind: type[gym.Wrapper]) -> bool:
     """
     :param env: The environments
