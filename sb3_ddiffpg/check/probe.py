@@ -117,7 +117,9 @@ def _opened(env: Any, seed: int, env_kwargs: dict[str, Any]) -> Iterator[Any]:
     try:
         made = make_vec_env(env, 1, seed=seed, env_kwargs=env_kwargs)
     except (gym.error.Error, ImportError, TypeError) as error:
-        raise ValueError(f"env: {env!r} cannot be made with {env_kwargs}: {error}") from error
+        given = f" with {env_kwargs}" if env_kwargs else ""
+        said = " ".join([str(error), *getattr(error, "__notes__", ())])
+        raise ValueError(f"env: {env!r} cannot be made{given}: {said}") from error
     try:
         yield made
     finally:

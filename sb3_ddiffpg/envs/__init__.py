@@ -79,7 +79,12 @@ def registered_spec(env_id: str) -> EnvSpec:
     elif name not in gym.registry:
         with contextlib.suppress(ImportError):
             gym.register_envs(import_module("gymnasium_robotics"))
-    return gym.spec(name)
+    try:
+        return gym.spec(name)
+    except gym.error.Error as error:
+        if not module:
+            error.add_note(f'An environment that another package or file registers needs its module: "module:{name}"')
+        raise
 
 
 def registered_id(env_id: str) -> str:

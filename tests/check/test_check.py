@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ddiffpg import check_env
 from sb3_ddiffpg.check.command import main
+from sb3_ddiffpg.envs import make_vec_env
 
 LENGTH = 10
 
@@ -365,3 +366,12 @@ def test_a_goal_environment_behind_a_time_limit_is_not_complained_of(capsys):
         assert "GoalEnv" not in capsys.readouterr().out
     finally:
         gym.registry.pop(name)
+
+
+def test_an_id_that_nobody_has_registered():
+    """As a package's own or a stranger's: the latter needs its module."""
+    for ask in (check_env, make_vec_env):
+        with pytest.raises((ValueError, gym.error.Error)) as caught:
+            ask("NoSuchRoom-v0")
+        said = " ".join([str(caught.value), *getattr(caught.value, "__notes__", ())])
+        assert '"module:NoSuchRoom-v0"' in said and "{}" not in said
