@@ -24,7 +24,7 @@ class AnyGoal(gym.Env):
     """
     A point in the plane, and a place to go to.
 
-    :param fixed: Whether it is always the same
+    :param fixed: Whether it is always the same, but for a sensor's noise
     :param extra: What the reward has beside that of the goal
     :param dense: Whether it is the distance
     :param latches: Whether the episode ends there
@@ -47,7 +47,7 @@ class AnyGoal(gym.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.position, self.steps = self.np_random.uniform(-0.1, 0.1, 2), 0
-        self.goal = np.full(2, 2.0) if self.fixed else self.np_random.uniform(-3, 3, 2)
+        self.goal = 2.0 + self.np_random.normal(0, 1e-4, 2) if self.fixed else self.np_random.uniform(-3, 3, 2)
         return self._observation(), {}
 
     def step(self, action):
