@@ -127,12 +127,13 @@ def _labels(model: Any, runs: list[list[EpisodeResult]]) -> tuple[list[list[str 
     # As the model finds them, where it does
     settings = getattr(model, "mode_settings", ModeSettings())
     buffer = getattr(model, "replay_buffer", None)
-    if isinstance(buffer, ModeReplayBuffer) and (buffer.size() or not buffer.features.whole_observation):
+    if isinstance(buffer, ModeReplayBuffer) and (buffer.size() or not buffer.standardize):
         paths = [buffer.resample(episode.path) for episode in successes]
         normalize, linkage = buffer.normalize_distances, settings.linkage
     else:
         full = [episode.path for episode in successes]
-        if full[0].shape[1] > 3:  # a whole observation, whose components have scales of their own
+        # Of a whole observation, and of what was found in one, each component has a scale of its own
+        if full[0].shape[1] > 3 or getattr(buffer, "standardize", False):
             scale = np.maximum(np.concatenate(full).std(axis=0), 1e-6)
             full = [path / scale for path in full]
         compared_length = getattr(buffer, "compared_length", None)

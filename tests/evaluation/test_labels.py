@@ -9,7 +9,7 @@ from gymnasium.wrappers import TimeLimit, TransformReward
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
-from sb3_ddiffpg import ModeEvalCallback
+from sb3_ddiffpg import DDiffPG, ModeEvalCallback
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.envs.vec_env import WorkerVecEnv
 from sb3_ddiffpg.evaluation import clustering_agreement, evaluate_modes, run_episodes
@@ -105,3 +105,14 @@ def test_our_tasks_declare_theirs(single):
     model = small_model(env).learn(400)
     labels = all_labels(model) - {None}
     assert labels and all(label[:2] in ("0:", "1:") for label in labels)
+
+
+def test_a_model_without_its_buffer_tells_routes_by_standardised_features(tmp_path):
+    """What they are divided by is measured in the buffer, which a file does not hold."""
+    model = small_model(DummyVecEnv([TwoEnds] * 4), mode_features=[0], modes={"distance_threshold": None}).learn(400)
+    assert model.replay_buffer.standardize
+    model.save(tmp_path / "model")
+    loaded = DDiffPG.load(tmp_path / "model")
+    assert not loaded.replay_buffer.size()
+    found = evaluate_modes(loaded, DummyVecEnv([TwoEnds]), n_episodes=5, deterministic=False)
+    assert found.label_source == "clustering" and found.uncommanded.n_successes and found.uncommanded.labels
