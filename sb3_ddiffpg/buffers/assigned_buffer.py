@@ -107,8 +107,7 @@ class AssignedReplayBuffer(PathReplayBuffer):
         """
         :return: All that train a mode
         """
-        used = *self.trajectories(success=True), *self.trajectories(success=False), *self.groups.retired
-        return [each for each in used if each.trains]
+        return [each for each in self.finished_trajectories() if each.trains]
 
     def _step_fields(self) -> Fields:
         action = ((self.action_dim,), np.float32)
@@ -214,7 +213,7 @@ class AssignedReplayBuffer(PathReplayBuffer):
         """
         Hand the trajectories to their new modes and rebuild the modes' rows. Each mode learns from its newest direct successes
         and its newest failures, and remembers as many detours for the next clustering; the rest retires to exploration.
-        While nobody has said what a success is, a long one is no detour, and a mode goes on learning from what has retired.
+        Where it ``learns_from_all``, a long one is no detour, and a mode goes on learning from what has retired.
 
         :param successes: In order of finishing
         :param success_modes: New mode of each, ``NO_MODE`` for outliers
@@ -297,9 +296,7 @@ class AssignedReplayBuffer(PathReplayBuffer):
         """
         :return: Finished ones but those that took a new route to a goal
         """
-        used = *self.trajectories(success=True), *self.trajectories(success=False)
-        finished = [*used, *self.groups.retired, *self.groups.past_goals()]
-        return [each for each in finished if self.route_novelty[each.rows[-1]] == 0]
+        return [each for each in self.finished_trajectories() if self.route_novelty[each.rows[-1]] == 0]
 
     def mark_off_route(self, trajectory: Trajectory, members: list[Trajectory]) -> None:
         """

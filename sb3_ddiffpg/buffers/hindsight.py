@@ -12,7 +12,7 @@ from sb3_ddiffpg.buffers.trajectory import Trajectory
 from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
 from sb3_ddiffpg.utils.vec_envs import ask_first, has_method
 
-#: Of a mode's transitions. Four of five are those of the original's four other goals for each own one, and SB3's
+#: Of a mode's transitions: four others for each that keeps its goal, as in the paper and in SB3's ``HerReplayBuffer``
 RELABELLED_SHARE = 0.8
 # Rows that are looked at to see whether goals differ and rewards follow from them, and how many of them may not
 _LOOKED_AT, _MOST_OTHERS = 256, 0.05

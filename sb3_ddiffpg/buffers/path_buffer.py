@@ -118,10 +118,8 @@ class PathReplayBuffer(TrajectoryReplayBuffer):
         """
         :return: Rows of every stored episode, in order, also of those in progress
         """
-        used = *self.trajectories(success=True), *self.trajectories(success=False)
-        finished = [*used, *self.groups.retired, *self.groups.past_goals()]
         running = [self.running.of(env) for env in np.flatnonzero(self.running.lengths).tolist()]
-        return [*(each.rows for each in finished), *running]
+        return [*(each.rows for each in self.finished_trajectories()), *running]
 
     def reached(self, rows: np.ndarray) -> np.ndarray:
         """

@@ -241,6 +241,13 @@ class TrajectoryReplayBuffer(RowReplayBuffer):
         if least is not None:
             self.groups.judge_again(lambda trajectory: trajectory.episode_return >= least)
 
+    def finished_trajectories(self) -> list[Trajectory]:
+        """
+        :return: All that are stored: in use, retired, and what episodes did after their goals
+        """
+        used = *self.trajectories(success=True), *self.trajectories(success=False)
+        return [*used, *self.groups.retired, *self.groups.past_goals()]
+
     def drop_unfinished_episodes(self) -> None:
         """Forget the transitions of running episodes: call it when the environments were reset outside."""
         for env in range(self.n_envs):

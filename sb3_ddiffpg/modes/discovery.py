@@ -8,6 +8,7 @@ import numpy as np
 
 from sb3_ddiffpg.buffers.mode_buffer import ModeReplayBuffer
 from sb3_ddiffpg.buffers.trajectory import NO_MODE, Trajectory
+from sb3_ddiffpg.clustering.linkage import without_outliers
 from sb3_ddiffpg.clustering.matching import ModeMatching, assign_to_nearest, match_modes, medoid
 from sb3_ddiffpg.modes.mode import Mode
 from sb3_ddiffpg.modes.settings import ModeSettings
@@ -99,6 +100,9 @@ def find_modes(
     if len(successes) >= (settings.min_size if buffer.has_outliers else 1):
         distances = buffer.success_distances(successes)
         labels = cluster(distances)
+        if not buffer.has_outliers:
+            # The best so far is a way to begin with, as single and unlike the others as it may be
+            labels = without_outliers(labels, distances)
 
     rng = np.random.RandomState(np.random.randint(2**31))
     dormant = [mode for mode in _dormant(found, len(modes)) if mode not in retired]
@@ -160,10 +164,9 @@ def readmit_homeless(buffer: ModeReplayBuffer, numbers: set[int]) -> None:
 
 def _before_any_success(failures: list[Trajectory], abandoned: list[Trajectory]) -> Reclustering:
     """One mode of all failures, if there are any: they have all reached some goal, if not the one that was meant."""
-    matching = ModeMatching(parents=[None], kept=[False], merged={}, retired=[])
+    n_modes = min(len(failures), 1)
+    matching = ModeMatching(parents=[None] * n_modes, kept=[False] * n_modes, merged={}, retired=[])
     labels, distances = np.zeros(0, dtype=int), np.zeros((0, 0), dtype=np.float32)
-    if not failures:
-        matching = ModeMatching(parents=[], kept=[], merged={}, retired=[])
     return Reclustering(
         [], labels, distances, failures, np.zeros(len(failures), dtype=int), abandoned, matching, counters=[], off_mode=[]
     )

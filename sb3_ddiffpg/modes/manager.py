@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_ddiffpg.buffers.mode_buffer import ModeReplayBuffer
 from sb3_ddiffpg.buffers.trajectory import NO_MODE, Trajectory
-from sb3_ddiffpg.clustering.linkage import cluster, without_outliers
+from sb3_ddiffpg.clustering.linkage import cluster
 from sb3_ddiffpg.modes.discovery import find_modes, readmit_homeless, retired_modes, surpassed_modes
 from sb3_ddiffpg.modes.history import ModeEvent, ModeHistory, succeed
 from sb3_ddiffpg.modes.mode import Mode, ModeTable, Outcome, check_name, default_name, modes_from_state, modes_state
@@ -62,7 +62,6 @@ class ModeManager:
         self.next_number = 0
         #: Whether the environment itself has said what a success is
         self.success_is_told = False
-        self._has_outliers = True
 
     def __len__(self) -> int:
         return len(self.modes)
@@ -101,7 +100,6 @@ class ModeManager:
         :return: What happened: births, splits, merges and retirements
         """
         self.success_is_told = buffer.has_success_signal
-        self._has_outliers = buffer.has_outliers
         if self.success_is_told:
             retired = retired_modes(self.modes, self.settings.trials)
         else:
@@ -134,9 +132,7 @@ class ModeManager:
         settings = self.settings
         if settings.max_modes == 1:
             return np.zeros(len(distances), dtype=int)  # clustering off: whatever reaches the goal is the one mode
-        labels = cluster(distances, settings.distance_threshold, settings.linkage, settings.max_modes, settings.min_size)
-        # Where one learns from all, the best so far is a way to begin with, as single and unlike the others as it may be
-        return labels if self._has_outliers else without_outliers(labels, distances)
+        return cluster(distances, settings.distance_threshold, settings.linkage, settings.max_modes, settings.min_size)
 
     def hold(self, modes: list[Mode], buffer: ModeReplayBuffer, followers: Followers) -> None:
         """
