@@ -96,7 +96,7 @@ class AssignedReplayBuffer(PathReplayBuffer):
     @property
     def has_outliers(self) -> bool:
         """Whether a success may be of no mode: where it has been told what one is, but not where all reach something."""
-        return self.has_success_signal and not self.has_hindsight
+        return self.goals_are_told and not self.has_hindsight
 
     @property
     def learns_from_all(self) -> bool:
@@ -150,6 +150,17 @@ class AssignedReplayBuffer(PathReplayBuffer):
         trajectory = super()._store(env, info)
         self.goals[trajectory.rows[-1]] = trajectory.success
         return trajectory
+
+    def _stands_in(self, episode_return: float) -> bool:
+        # Where other goals than the given ones are learned from, no success is needed to begin with
+        return not self.has_hindsight and super()._stands_in(episode_return)
+
+    def judge_by_returns(self) -> None:
+        """See ``TrajectoryReplayBuffer``."""
+        if self.has_hindsight:  # the first episodes came before that was known
+            self.groups.judge_again(lambda trajectory: False)
+        else:
+            super().judge_by_returns()
 
     def _take_back_successes(self) -> None:
         taken = self.trajectories(success=True)

@@ -129,7 +129,7 @@ class ModeReplayBuffer(AssignedReplayBuffer):
             rows[EXPLORATORY_GROUP, :n_new] = np.random.choice(self.new_route_rows, n_new)
         windows = self._windows(rows, exploration_n_steps, mode_n_steps)
         notes = self.notes.take(windows)
-        goals_are_told: Any = self.has_success_signal
+        goals_are_told: Any = self.goals_are_told
         relabelling = None
         if self.hindsight is not None and self.has_hindsight and n_groups > 1:
             relabelling = self.hindsight.relabel(self, rows, windows, notes)

@@ -62,6 +62,7 @@ class _Buffer(msgspec.Struct, forbid_unknown_fields=True):
     goal_steps: np.ndarray | None = None
     goal_labels: list[str | None] | None = None
     unfounded_modes: list[int] | None = None
+    has_goal: bool | None = None
 
 
 # Settings on which they depend, beside ``n_path_points``
@@ -117,6 +118,7 @@ def buffer_state(buffer: Any) -> dict[str, Any] | None:
         "frozen_modes": sorted(buffer.groups.frozen_modes),
         "n_finished": buffer.n_finished,
         "has_signal": rule.has_signal,
+        "has_goal": rule.has_goal,
         "recent_returns": list(rule.recent_returns),
         "episode_steps": rule.steps,
         "goal_steps": rule.goal_steps,
@@ -170,7 +172,9 @@ def restore_buffer(buffer: Any, tree: Any) -> None:
     buffer.groups.frozen_modes = set(state.frozen_modes)
     buffer.n_finished = state.n_finished
     rule = buffer.success_rule
-    rule.has_signal = rule.has_key = state.has_signal
+    rule.has_signal = rule.has_key = rule.has_goal = state.has_signal
+    if state.has_goal is not None:  # of later versions than 0.1
+        rule.has_goal = state.has_goal
     rule.recent_returns.extend(state.recent_returns)
     rule.steps = (state.running_length if state.episode_steps is None else state.episode_steps).copy()
     if state.goal_steps is not None and state.goal_labels is not None:

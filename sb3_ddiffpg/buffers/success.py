@@ -14,7 +14,7 @@ from sb3_ddiffpg.utils.vec_envs import route_label
 SUCCESS_KEYS = ("is_success", "success")
 # So much alike are names of which one may be a misspelling of the other
 CLOSE = 0.8
-#: Of the returns seen lately, while nobody has said what a success is
+#: Of the returns seen lately, while nobody has told a success
 BEST_SHARE = 0.2
 
 
@@ -72,7 +72,9 @@ class GoalWatch:
         self.success_key, self.labelled = success_key, labelled
         #: Whether an environment has ever said something
         self.has_signal = False
-        #: And by the key that is looked for now
+        #: Whether it has ever been that a goal was reached
+        self.has_goal = False
+        #: And whether it was said by the key that is looked for now
         self.has_key = False
         #: Steps of each running episode, and how many it took to its goal, 0 while it has not got there
         self.steps = np.zeros(n_envs, dtype=np.int64)
@@ -106,6 +108,7 @@ class GoalWatch:
         self.steps[env] += 1
         if said is not None:
             self.has_signal = self.has_key = True
+            self.has_goal |= said
             if said and not self.goal_steps[env]:
                 self.goal_steps[env], self.labels[env] = self.steps[env], route_label(info, self.labelled)
 
@@ -129,8 +132,9 @@ class GoalWatch:
 
 class SuccessRule(GoalWatch):
     """
-    Tells whether a stored episode reached its goal: by the environment's word, or, while no environment has ever given it, by
-    a return in the top fifth of those seen lately, so that the algorithm also learns on an ordinary dense-reward task.
+    Tells whether a stored episode reached its goal: by the environment's word, or, while no environment has ever told of a
+    goal, by a return in the top fifth of those seen lately, so that the algorithm also learns where rewards lead the way.
+    Where they do not, all returns are alike before the first goal, and none stands in for it.
 
     :param success_key: Key of ``info``; None looks for ``SUCCESS_KEYS``. One that is given is waited for: until then all fail
     :param n_envs: Number of environments
@@ -143,7 +147,7 @@ class SuccessRule(GoalWatch):
 
     def among_best(self, episode_return: float) -> bool:
         """
-        What stands in for a success while nobody has said what one is.
+        What stands in for a success while nobody has told one.
 
         :param episode_return: Of an episode that has just been stored
         :return: Whether it is in the top fifth of those seen lately
@@ -166,7 +170,7 @@ class SuccessRule(GoalWatch):
 
     @property
     def _stands_in(self) -> bool:
-        return not self.has_signal and self.success_key is None
+        return not self.has_goal and self.success_key is None
 
     def check_key(self, info: dict[str, Any]) -> None:
         """

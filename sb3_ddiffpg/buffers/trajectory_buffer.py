@@ -141,9 +141,9 @@ class TrajectoryReplayBuffer(RowReplayBuffer):
         self.next_row[before] = rows[goes_on]
         started = np.flatnonzero(self.success_rule.steps == 0)
         self.running.extend(rows, reward)
-        had_signal = self.success_rule.has_signal
+        had_goal = self.success_rule.has_goal
         self.success_rule.observe(infos, said)
-        if self.success_rule.has_signal and not had_signal:
+        if self.success_rule.has_goal and not had_goal:
             self._take_back_successes()
 
         finished: list[tuple[int, Trajectory]] = []
@@ -205,7 +205,7 @@ class TrajectoryReplayBuffer(RowReplayBuffer):
         to_goal = told.length - before if reached else 0 if told.success else len(rows)
         whole = self._stored(rows[:to_goal], episode_return, told.label) if to_goal else None
         if whole is not None:
-            whole.success = reached or self.success_rule.among_best(episode_return)
+            whole.success = reached or self._stands_in(episode_return)
             self._insert(whole)
         past = rows[to_goal:]
         if not len(past):
@@ -218,6 +218,10 @@ class TrajectoryReplayBuffer(RowReplayBuffer):
         self._insert(rest)
         return rest if whole is None else whole
 
+    def _stands_in(self, episode_return: float) -> bool:
+        """Whether an episode of this return counts as a success, of which nobody has told one yet."""
+        return self.success_rule.among_best(episode_return)
+
     def _stored(self, rows: np.ndarray, episode_return: float, label: str | None) -> Trajectory:
         self.n_finished += 1
         return Trajectory(rows, success=False, episode_return=episode_return, serial=self.n_finished - 1, label=label)
@@ -227,14 +231,14 @@ class TrajectoryReplayBuffer(RowReplayBuffer):
 
     def _take_back_successes(self) -> None:
         """
-        Judge again what is stored. Until an environment said for the first time what a success is, the best returns stood in
-        for successes; of those episodes none has reached a goal, or it would have been said.
+        Judge again what is stored. Until an environment told of a goal for the first time, the best returns stood in for
+        successes; of those episodes none has reached a goal, or it would have been said.
         """
         self.groups.judge_again(lambda trajectory: False)
 
     def judge_by_returns(self) -> None:
         """
-        While nobody has said what a success is: take those for it whose returns are the best by now. What was among the best
+        While nobody has told a success: take those for it whose returns are the best by now. What was among the best
         at its time may be none any more, and the first were judged beside nothing.
         """
         least = self.success_rule.best_from()
@@ -257,8 +261,13 @@ class TrajectoryReplayBuffer(RowReplayBuffer):
 
     @property
     def has_success_signal(self) -> bool:
-        """Whether the environment itself says what a success is."""
+        """Whether the environment itself says what a success is, if only that there was none."""
         return self.success_rule.has_signal
+
+    @property
+    def goals_are_told(self) -> bool:
+        """Whether the environment has told of a goal; before that the best returns stand in for it."""
+        return self.success_rule.has_goal
 
     def trajectories(self, success: bool) -> list[Trajectory]:
         """

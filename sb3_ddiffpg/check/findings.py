@@ -19,7 +19,7 @@ class SuccessSignal:
     :param n_steps: Steps that said something
     :param n_mid_episode: Steps at which it was True and the episode went on
     :param n_counted: Episodes that training would take for goal-reached ones
-    :param stands_in: Whether these are the best of the returns, since nobody has said what a success is
+    :param stands_in: Whether these are the best of the returns, since nobody has told a success
     :param asked_for: The key that was given, if no step had it
     :param candidates: Other keys of ``info`` that were True or False
     """
@@ -202,11 +202,14 @@ class EnvCheck:
             if signal.n_steps == self.n_steps
             else "at some steps"
         )
-        lines = [f'info["{signal.key}"], told {how}; {counted} counted']
+        reached = f"0 of {n} episodes" if signal.stands_in else counted
+        lines = [f'info["{signal.key}"], told {how}; {reached} counted']
         if signal.n_mid_episode:
             lines.append(f"it was True at {signal.n_mid_episode} steps after which the episode went on")
-        if not signal.n_counted:
+        if signal.stands_in or not signal.n_counted:
             lines.append("random actions have not reached it, which is usual: exploration goes on from here")
+        if signal.stands_in and signal.n_counted:
+            lines.append(f"until one does, the best fifth of the returns stands in for it ({counted})")
         if self.relabels is not None:
             differ = "modes also learn from each episode as if the goal had been where it went"
             lines.append(

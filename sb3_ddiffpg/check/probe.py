@@ -273,7 +273,7 @@ def _success(model: DDiffPG, listener: _Listener) -> SuccessSignal:
         n_mid_episode=0 if rule_key is None else listener.mid_episode[rule_key],
         n_counted=len(model.replay_buffer.trajectories(success=True)),
         asked_for=None if rule_key is not None else model.success_key,
-        stands_in=not model.replay_buffer.has_success_signal and model.success_key is None,
+        stands_in=not model.replay_buffer.goals_are_told and model.success_key is None,
         candidates=tuple(listener.candidates),
     )
 

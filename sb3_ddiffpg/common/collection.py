@@ -197,7 +197,7 @@ class CollectingAlgorithm(SavableAlgorithm):
             buffer, last = self.replay_buffer, trajectory.rows[-1]
             rewards = self.reward_scale * buffer.training_rewards(trajectory.rows, self._vec_normalize_env)
             goes_on = bool(buffer.timeouts[last] or not buffer.dones[last])
-            at_goal = bool(buffer.goals[last]) and buffer.has_success_signal
+            at_goal = bool(buffer.goals[last]) and buffer.goals_are_told
             then = "ends" if not goes_on else "stays" if at_goal else "goes on"
             returns = discounted_returns(rewards, self.gamma, then)
             self.value_range.observe(returns)

@@ -265,7 +265,8 @@ class DDiffPG(ActorCriticAlgorithm):
             raise ValueError(f"modes.representative: accepted are positions of {dim} components")
         self.replay_buffer.expect_modes(len(self.mode_manager))
         if self.mode_manager.success_is_told:  # so the best returns are no longer a stand-in, in a new buffer either
-            self.replay_buffer.success_rule.has_signal = True
+            rule = self.replay_buffer.success_rule
+            rule.has_signal = rule.has_goal = True
 
     def _create_aliases(self) -> None:
         super()._create_aliases()
@@ -494,7 +495,8 @@ class DDiffPG(ActorCriticAlgorithm):
         for env, trajectory in record.finished:
             commanded = self.scheduler.commanded_mode(env)
             if commanded is not None:
-                self.mode_manager.note_outcome(commanded, trajectory)
+                stands_in = self.replay_buffer.has_success_signal and not self.replay_buffer.goals_are_told
+                self.mode_manager.note_outcome(commanded, trajectory, stands_in)
             self.scheduler.begin(env, self._exploration_share())
         for env, _ in record.parts:
             if env not in dict(record.finished):

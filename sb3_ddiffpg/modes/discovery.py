@@ -121,7 +121,7 @@ def find_modes(
     counters = [Counters(*each) for each in zip(doubts, misses, strict=True)]
     failure_labels = _share_out(buffer, failures, successes, labels, heirs, rng)
     outcome = Reclustering(successes, labels, distances, failures, failure_labels, abandoned, matching, counters, [])
-    return _off_mode_apart(outcome, heirs) if buffer.has_success_signal else outcome
+    return _off_mode_apart(outcome, heirs) if buffer.goals_are_told else outcome
 
 
 def retired_modes(modes: Sequence[Mode], trials: int) -> list[int]:

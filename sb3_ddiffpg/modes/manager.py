@@ -60,7 +60,7 @@ class ModeManager:
         self.modes: list[Mode] = []
         self.history = ModeHistory()
         self.next_number = 0
-        #: Whether the environment itself has said what a success is
+        #: Whether the environment itself has told of a success
         self.success_is_told = False
 
     def __len__(self) -> int:
@@ -99,7 +99,7 @@ class ModeManager:
         :param births: Whether modes may be born; the first always may
         :return: What happened: births, splits, merges and retirements
         """
-        self.success_is_told = buffer.has_success_signal
+        self.success_is_told = buffer.goals_are_told
         if self.success_is_told:
             retired = retired_modes(self.modes, self.settings.trials)
         else:
@@ -230,13 +230,14 @@ class ModeManager:
 
     # ------------------------------------------------------------------ training episodes
 
-    def note_outcome(self, index: int, trajectory: Trajectory) -> None:
+    def note_outcome(self, index: int, trajectory: Trajectory, stands_in: bool = False) -> None:
         """
         :param index: Of the mode that has driven an episode from its beginning
         :param trajectory: The episode
+        :param stands_in: Whether it can be but one of the best returns, for the environment says that no goal was reached
         """
         mode = self.modes[index]
-        mode.outcomes.append(Outcome(trajectory.success, trajectory.episode_return, trajectory.length))
+        mode.outcomes.append(Outcome(trajectory.success and not stands_in, trajectory.episode_return, trajectory.length))
         mode.unjudged += 1
 
     def mean_length(self) -> float | None:

@@ -59,6 +59,14 @@ class AnyGoal(gym.Env):
         return observation, reward, reached and self.latches, self.steps >= self.limit, {"is_success": reached}
 
 
+class NeverTold(gym.Wrapper):
+    """As if no goal were ever reached."""
+
+    def step(self, action):
+        *step, info = super().step(action)
+        return *step, {**info, "is_success": False}
+
+
 def made(n_envs=2, wrapper=lambda env: env, learning_starts=100, **kwargs):
     env = DummyVecEnv([lambda: wrapper(AnyGoal(**kwargs))] * n_envs)
     env.seed(0)
@@ -75,6 +83,15 @@ def with_modes(**kwargs):
 
 def distance(a, b):
     return np.linalg.norm(a - b, axis=-1)
+
+
+def test_no_return_stands_in_for_a_goal_where_other_goals_can_be_learned_from():
+    """The best of dense returns are those whose goal was near: no mode is made of them, but one of all."""
+    model = made(wrapper=NeverTold, dense=True, learning_starts=10_000).learn(400)
+    buffer = model.replay_buffer
+    returns = {each.episode_return for each in buffer.finished_trajectories()}
+    assert buffer.has_hindsight and buffer.has_success_signal and len(returns) == 20
+    assert buffer.trajectories(True) == [] and len(model.modes) == 1
 
 
 @pytest.mark.parametrize("latches", [False, True])
@@ -242,6 +259,7 @@ def test_a_mode_begins_before_any_success():
     critics = belongings(model)[mode.name]
     # Now it is within reach of some; no re-clustering but this one
     latest = {each.serial for each in buffer.trajectories(success=False)[-3:]}
+    buffer.success_rule.has_goal = True
     buffer.groups.judge_again(lambda trajectory: trajectory.serial in latest)
     model.recluster()
     assert [(each.number, each.n_trajectories) for each in model.modes] == [(mode.number, 3)]

@@ -177,6 +177,7 @@ class BufferMachine(RuleBasedStateMachine):
         size = self.longest * (n_envs + self.most_modes) + spare
         limits = {"max_successes_per_mode": 4, "max_failures_per_mode": 2}
         self.buffer = make_buffer(size, n_envs, **limits, explore_beyond_goals=beyond)
+        self.buffer.success_rule.has_goal = True  # before that the best returns stand in
         self.bonus = ExplorationBonus(VisitCounts(2, 2), 2, NoveltySettings(), None, n_envs, CellGrid(2, 1.0))
         self.plain = PlainBuffer(size, n_envs, 4, 2, beyond)
 

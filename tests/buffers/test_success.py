@@ -244,10 +244,15 @@ def test_the_best_are_those_of_now():
     episode(buffer, np.arange(4.0), [{}, {}, {"is_success": True}], [0.0, 0.0, -5.0], "terminated")
     buffer.judge_by_returns()
     assert [t.episode_return for t in buffer.trajectories(True)] == [-5.0]
-    # Nor where a key is waited for, or where all are alike
-    for other, total in ((make_buffer(success_key="solved"), 1.0), (make_buffer(), 0.0)):
+    # Nor where a key is waited for, or where all are alike, whatever is said
+    for other, total, word in (
+        (make_buffer(success_key="solved"), 1.0, {}),
+        (make_buffer(success_key="solved"), 1.0, {"solved": False}),
+        (make_buffer(), 0.0, {}),
+        (make_buffer(), 0.0, {"is_success": False}),
+    ):
         for k in range(5):
-            episode(other, np.arange(4.0), [{}] * 3, [0.0, 0.0, k * total], "truncated")
+            episode(other, np.arange(4.0), [word] * 3, [0.0, 0.0, k * total], "truncated")
         other.judge_by_returns()
         assert other.trajectories(True) == []
 
@@ -288,19 +293,21 @@ def _all(buffer):
     return [*(each for group in buffer.groups.members.values() for each in group), *buffer.groups.retired]
 
 
-def test_what_stood_in_for_successes_is_taken_back():
-    """With the first word of the environment, in mid-episode; by hand."""
+@pytest.mark.parametrize("word", [{}, {"is_success": False}])
+def test_what_stood_in_for_successes_is_taken_back(word):
+    """With the first goal that is told, in mid-episode; by hand. Until then it may have been said that there is none."""
     buffer = make_buffer(new_route_share=0.25)
     for total in range(10):
-        episode(buffer, np.arange(4.0), [{}] * 3, [0.0, 0.0, float(total)], "truncated")
+        episode(buffer, np.arange(4.0), [word] * 3, [0.0, 0.0, float(total)], "truncated")
     before = buffer.trajectories(True)
-    assert [t.episode_return for t in before] == [*range(1, 10)] and not buffer.has_success_signal
+    assert [t.episode_return for t in before] == [*range(1, 10)]
+    assert buffer.has_success_signal == bool(word) and not buffer.goals_are_told
     successes, failures = before, buffer.trajectories(False)
     buffer.assign_modes(successes, np.array([0] * 4 + [1] * 4 + [NO_MODE]), failures, np.array([1]), [None, None])
     assert len(buffer.new_route_rows)
     sizes = [row_set.size for row_set in buffer.mode_rows]
-    episode(buffer, np.arange(9.0), [{}, {}, {"is_success": True}, {}], [0.0] * 4, None)
-    assert buffer.has_success_signal and buffer.trajectories(True) == []
+    episode(buffer, np.arange(9.0), [word, word, {"is_success": True}, word], [0.0] * 4, None)
+    assert buffer.goals_are_told and buffer.trajectories(True) == []
     assert [t.serial for t in buffer.trajectories(False)] == list(range(10))
     assert not buffer.goals.any() and not buffer.route_novelty.any() and not len(buffer.new_route_rows)
     assert buffer.unfounded_modes == {0, 1} and [row_set.size for row_set in buffer.mode_rows] == sizes
@@ -484,7 +491,7 @@ def test_an_endless_episode_is_stored_in_parts():
         for k in range(95):
             obs = np.array([[k, 0], [k + 1000, 0]], dtype=np.float32)
             infos = [{"is_success": k == 33}, {"is_success": False}]
-            record = buffer.add(obs, obs + 1, np.zeros((2, 1)), np.full(2, float(k)), np.zeros(2, dtype=bool), infos)
+            record = buffer.add(obs, obs + 1, np.zeros((2, 1)), np.zeros(2), np.zeros(2, dtype=bool), infos)
             assert record.finished == []
             parts += [(k, env, t.length, t.success, t.mode) for env, t in record.parts]
             started += record.started.tolist()

@@ -239,6 +239,9 @@ def test_outcomes_make_a_mode_able():
     assert up.success_rate == pytest.approx(1 / 3) and up.unjudged == 3 and manager.mastered() == {}
     manager.note_outcome(1, reached)
     assert manager.mastered() == {1: 1} and up.unjudged == 4 and manager.modes[0].unjudged == 0
+    # One of the best returns, but no goal
+    manager.note_outcome(1, reached, stands_in=True)
+    assert up.success_rate == pytest.approx(2 / 5) and up.outcomes[-1].episode_return == reached.episode_return
 
 
 def test_unknown_modes_wait_under_new_names():
