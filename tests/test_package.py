@@ -80,7 +80,17 @@ def test_metadata(wheel):
     assert metadata["Name"] == "sb3_ddiffpg"
     assert metadata["License-Expression"] == "MIT"
     assert set(metadata["Requires-Python"].split(",")) == {">=3.11", "<3.13"}
-    assert set(metadata.get_all("Provides-Extra")) == {"franka", "zoo", "plots", "hub", "cluster", "fuzz", "dev", "all"}
+    assert set(metadata.get_all("Provides-Extra")) == {
+        "franka",
+        "zoo",
+        "plots",
+        "hub",
+        "cluster",
+        "onnx",
+        "fuzz",
+        "dev",
+        "all",
+    }
     assert "ddiffpg = sb3_ddiffpg.zoo:main" in scripts
     assert "ddiffpg-experiments = sb3_ddiffpg.experiments.__main__:main" in scripts
     pybullet = [Requirement(line) for line in metadata.get_all("Requires-Dist") if line.startswith("pybullet")]

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ENVS_MAY_IMPORT = ("utils", "serialization")
-MOST_AT_TOP, MOST_ARGUMENTS, MOST_METHODS, MOST_PRIVATE, MOST_LONG_FILES = 4, 34, 65, 25, 1
+MOST_AT_TOP, MOST_ARGUMENTS, MOST_METHODS, MOST_PRIVATE, MOST_LONG_FILES = 4, 34, 66, 25, 1
 
 
 def _counting() -> ModuleType:

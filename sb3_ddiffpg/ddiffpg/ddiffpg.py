@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import pathlib
 import time
 from typing import Any, ClassVar
@@ -20,6 +21,7 @@ from sb3_ddiffpg.buffers.trajectory import NO_MODE, StepRecord
 from sb3_ddiffpg.callbacks.clustering import ClusteringCallback, contains_clustering
 from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm, Metrics
 from sb3_ddiffpg.common.scales import settle_features
+from sb3_ddiffpg.ddiffpg.onnx_export import export_onnx
 from sb3_ddiffpg.ddiffpg.policies import CnnDiffusionPolicy, DiffusionPolicy
 from sb3_ddiffpg.exploration.episode_scheduler import EpisodeScheduler
 from sb3_ddiffpg.exploration.settings import ExplorationSettings, NoveltySettings
@@ -536,6 +538,23 @@ class DDiffPG(ActorCriticAlgorithm):
             self.mode_manager.expect_unknown(n_modes, self.lifetime_steps, self.replay_buffer, self.scheduler)
             self.bonus.on_modes_changed(self.replay_buffer, {})
         super().set_parameters(parameters, exact_match, device)
+
+    def export_onnx(self, path: str | os.PathLike, mode: str | int | Mode | None = None) -> None:
+        """
+        Save the policy as one ONNX file, which acts without torch and this package, see ``docs/deployment.md``. Its inputs are
+        ``observation`` (of a dict one for each key, ``observation.KEY``) as the environment gives it, [N, ...];
+        ``mode``, the index of each row's mode or -1 for none, int64, [N]; and ``noise``, standard normal, or 0 to act as
+        ``predict(deterministic=True)``, float32, [N, T, action_dim]. Its output is ``action``, [N, ...], in the environment's
+        units. What ``VecNormalize`` does to observations is inside, if the model has its environments. Images are as the model
+        sees them, channels first. The file is tried with onnxruntime before it is written.
+
+        :param path: Path to the file
+        :param mode: Name or index of the only mode, which is then no input; None: all
+        :raises ValueError: If there is no such mode
+        :raises ImportError: If the extra ``onnx`` is not installed
+        :raises RuntimeError: If onnxruntime does not compute what torch does; nothing is written then
+        """
+        export_onnx(self, path, None if mode is None else self.mode_manager.table.index(mode))
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """
