@@ -28,11 +28,11 @@ fuzz: .venv/.installed-dev
 	for test in $$($(BIN)/python tests/fuzz.py 2>&1 >/dev/null | tail -n +2); do \
 		OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz.py $$test -max_total_time=$(SECONDS) || exit 1; done
 
-# the fast tests with the lowest versions that setup.cfg accepts
+# the fast tests with the lowest versions that setup.cfg accepts, but for the extra that wants a newer torch
 oldest:
 	$(PYTHON) -m venv --clear .venv-oldest
 	.venv-oldest/bin/pip install --quiet uv
-	.venv-oldest/bin/uv pip install --python .venv-oldest/bin/python --quiet --resolution lowest-direct -e ".[all,dev]"
+	.venv-oldest/bin/uv pip install --python .venv-oldest/bin/python --quiet --resolution lowest-direct -e ".[franka,zoo,plots,hub,cluster,dev]"
 	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest -n 2
 
 # half an hour

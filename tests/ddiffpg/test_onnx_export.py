@@ -8,7 +8,6 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
-import onnxruntime
 import pytest
 import torch as th
 from environments import TwoEnds, small_model
@@ -21,6 +20,7 @@ import sb3_ddiffpg
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.ddiffpg import onnx_export
 
+onnxruntime = pytest.importorskip("onnxruntime")
 EXAMPLE = Path(__file__).parents[2] / "examples" / "control_loop.py"
 # The first of five steps of denoising magnifies the noise that is predicted by 103, with float32's rounding of it (2 ** -23)
 CLOSE = 1e-5 + 103 * 2**-23
