@@ -454,6 +454,7 @@ class DDiffPG(ActorCriticAlgorithm):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
         mode: str | int | list[str | int] | np.ndarray | None = None,
+        n_samples: int = 1,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
         Actions for one observation or a batch of them.
@@ -465,8 +466,10 @@ class DDiffPG(ActorCriticAlgorithm):
         :param mode: Name or index of the mode to follow, or one for each observation. None: a mode is drawn for each episode
             and kept through it by ``state`` and ``episode_start``; without those, the zero embedding, which leaves the
             choice to the policy at every step
+        :param n_samples: Of so many actions for each observation take that which the mode's critics like best (without a mode,
+            those of any). One of them has no noise, and where ``deterministic`` the others always have the same
         :return: The actions and the state for the next call
-        :raises ValueError: If there is no such mode
+        :raises ValueError: If there is no such mode, or ``n_samples`` is less than 1
         """
         indices: int | np.ndarray | None = None
         if mode is not None:
@@ -475,7 +478,7 @@ class DDiffPG(ActorCriticAlgorithm):
             if not single and len(mode) == 0:  # type: ignore[arg-type]
                 raise ValueError(f"mode={mode!r} is unknown: it names no mode")
             indices = table.index(mode) if single else np.array([table.index(each) for each in mode])  # type: ignore[arg-type, union-attr]
-        return self.policy.predict(observation, state, episode_start, deterministic, mode=indices)
+        return self.policy.predict(observation, state, episode_start, deterministic, mode=indices, n_samples=n_samples)
 
     def _training_actions(self) -> np.ndarray:
         length = self.mode_manager.mean_length()

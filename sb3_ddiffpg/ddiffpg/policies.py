@@ -1,7 +1,7 @@
 """DDiffPG's policy: a diffusion actor, the modes' critics and embeddings, and the choice of a mode to act."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -15,6 +15,16 @@ from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
 from sb3_ddiffpg.networks.diffusion import DiffusionActor
 from sb3_ddiffpg.networks.policies import TwinCriticPolicy
 from sb3_ddiffpg.utils.observations import batch_size, repeated
+
+
+class _Command(NamedTuple):
+    """What ``predict`` is asked for: the group of each row, and how many actions are drawn for each."""
+
+    groups: np.ndarray | None
+    n_samples: int
+
+
+_NO_COMMAND = _Command(None, 1)
 
 
 class DiffusionPolicy(TwinCriticPolicy):
@@ -101,7 +111,7 @@ class DiffusionPolicy(TwinCriticPolicy):
         )
         self.mode_embeddings: th.Tensor
         self.register_buffer("mode_embeddings", th.randn(n_modes + 1, mode_embedding_dim))
-        self._embeddings_in_use: th.Tensor | None = None
+        self._command = _NO_COMMAND
 
     @property
     def n_modes(self) -> int:
@@ -219,7 +229,45 @@ class DiffusionPolicy(TwinCriticPolicy):
         return values.unflatten(1, (-1, n_actions)).mean(dim=2)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        return self.actor(observation, deterministic, self._embeddings_in_use)
+        groups, n_samples = self._command
+        if n_samples == 1:
+            embeddings = None if groups is None else self.group_embeddings(groups)
+            return self.actor(observation, deterministic, embeddings)
+        return self.best_actions(observation, groups, n_samples, deterministic)
+
+    @th.no_grad()
+    def best_actions(
+        self, obs: PyTorchObs, groups: np.ndarray | None, n_samples: int, deterministic: bool = False
+    ) -> th.Tensor:
+        """
+        Of some actions for each observation that which the critics of its group like best; of a row without group, those of
+        any mode.
+
+        :param obs: N observations
+        :param groups: Rows of the embedding table, ``UNCONDITIONED`` for none, [N]; None: none in any row
+        :param n_samples: Actions for each, the first of which has no noise
+        :param deterministic: Whether the others always have the same noise
+        :return: Actions in [-1, 1], [N, action_dim]
+        """
+        n = batch_size(obs)
+        groups = np.full(n, UNCONDITIONED) if groups is None else groups
+        condition = self.actor.condition(obs, self.group_embeddings(groups))
+        diffusion = self.actor.diffusion
+        shape = (diffusion.n_steps, 1 if deterministic else n, n_samples, diffusion.denoiser.action_in.in_features)
+        generator = th.Generator(condition.device).manual_seed(0) if deterministic else None
+        noise = th.randn(shape, generator=generator, device=condition.device)
+        noise[:, :, 0] = 0.0
+        noise = noise.expand(-1, n, -1, -1).flatten(1, 2)
+        actions = diffusion.sample(condition.repeat_interleave(n_samples, 0), noise=noise).unflatten(0, (n, n_samples))
+        features = self.extract_features(obs, self.critic_features_extractor)
+        best = actions.new_empty(n, dtype=th.long)
+        for group in np.unique(groups).tolist():
+            rows = th.as_tensor(np.flatnonzero(groups == group), device=actions.device)
+            judges = slice(group, group + 1) if group >= 0 else slice(1, None) if self.n_modes else slice(0, 1)
+            repeated_features = features[rows].repeat_interleave(n_samples, 0)
+            values = self.critics.values_by(judges, repeated_features, actions[rows].flatten(0, 1)).amax(dim=0)
+            best[rows] = values.unflatten(0, (-1, n_samples)).argmax(dim=1)
+        return actions[th.arange(n, device=actions.device), best]
 
     def predict(
         self,
@@ -229,6 +277,7 @@ class DiffusionPolicy(TwinCriticPolicy):
         deterministic: bool = False,
         mode: int | np.ndarray | None = None,
         group: np.ndarray | None = None,
+        n_samples: int = 1,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
         Actions for one observation or a batch.
@@ -240,6 +289,7 @@ class DiffusionPolicy(TwinCriticPolicy):
         :param mode: Index of the mode to follow, one for all or one per observation. None: a mode is drawn for every
             episode (given ``state`` or ``episode_start``), else the zero embedding
         :param group: Rows of the embedding table, overrides ``mode``; for training
+        :param n_samples: See ``DDiffPG.predict``
         :return: The actions in the action space's bounds, and the state for the next call
         """
         held = None
@@ -253,20 +303,22 @@ class DiffusionPolicy(TwinCriticPolicy):
             if held.max(initial=UNCONDITIONED) >= self.n_modes:
                 raise ValueError(f"mode={held.max()} (or the one in state) is unknown; this policy has {self.n_modes} modes")
             group = np.where(held < 0, UNCONDITIONED, held + 1)
-        self._embeddings_in_use = None
+        if not isinstance(n_samples, int | np.integer) or n_samples < 1:
+            raise ValueError(f"n_samples: {n_samples!r} given; accepted are whole numbers from 1 up")
+        self._command = _Command(None, int(n_samples))
         # A tuple is the mistake that SB3's predict explains
         if group is not None and not isinstance(observation, tuple):
             n_obs = self.obs_to_tensor(observation)[0]
             n_rows = batch_size(n_obs)
             if len(group) not in (1, n_rows):
                 raise ValueError(f"Got modes, state or episode_start of {len(group)} for {n_rows} observation(s)")
-            self._embeddings_in_use = self.group_embeddings(np.broadcast_to(group, (n_rows,)).copy())
+            self._command = _Command(np.broadcast_to(group, (n_rows,)).copy(), int(n_samples))
             if held is not None:
                 state = (np.broadcast_to(held, (n_rows,)).copy(),)
         try:
             return super().predict(observation, state, episode_start, deterministic)
         finally:
-            self._embeddings_in_use = None
+            self._command = _NO_COMMAND
 
     def _draw_modes(self, state: tuple[np.ndarray, ...] | None, episode_start: np.ndarray | None) -> np.ndarray:
         """The modes to follow: kept through an episode, drawn uniformly at its start; -1 while there is none."""

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 from sb3_ddiffpg.envs.mazes.homotopy import HomotopyTracker
 from sb3_ddiffpg.envs.mazes.maze import LISTED_ROUTES, MAZES, Maze, reduce_word
 from sb3_ddiffpg.envs.mazes.point import PointMazeEnv, PointMazeVecEnv
+from sb3_ddiffpg.envs.vec_env.ray_actors import RayVecEnv
 from sb3_ddiffpg.envs.vec_env.tracing import TracingDummyVecEnv
 from sb3_ddiffpg.envs.vec_env.workers import WorkerVecEnv
 from sb3_ddiffpg.envs.wrappers import HideGoal
@@ -120,7 +121,7 @@ def make_vec_env(
     monitor_dir: str | None = None,
     wrapper_class: Callable[..., gym.Env] | None = None,
     env_kwargs: dict[str, Any] | None = None,
-    vec_env_cls: Callable[..., VecEnv] | None = None,
+    vec_env_cls: Callable[..., VecEnv] | str | None = None,
     vec_env_kwargs: dict[str, Any] | None = None,
     monitor_kwargs: dict[str, Any] | None = None,
     wrapper_kwargs: dict[str, Any] | None = None,
@@ -144,14 +145,16 @@ def make_vec_env(
     :param monitor_dir: folder of the monitors' files; None: no file is written
     :param wrapper_class: what is put around each environment and its monitor
     :param env_kwargs: arguments of ``gym.make``, such as ``max_episode_steps`` or ``maze_map``
-    :param vec_env_cls: a class of SB3's, such as ``SubprocVecEnv``
+    :param vec_env_cls: a class of SB3's, such as ``SubprocVecEnv``; or ``"ray"`` for the machines of a Ray cluster
+        (:class:`~sb3_ddiffpg.envs.vec_env.RayVecEnv`)
     :param vec_env_kwargs: further arguments of ``vec_env_cls``
     :param monitor_kwargs: further arguments of each ``Monitor``
     :param wrapper_kwargs: further arguments of ``wrapper_class``
     :param n_threads: threads of the ants' simulator, processes of the arm's; None: one per processor
     :param more_env_kwargs: the same as ``env_kwargs``, for arguments that are not called as one of these here
     :return: the vectorised environment, with monitor
-    :raises ValueError: if ``n_envs`` is less than 1, or an argument of the environment is given twice
+    :raises ValueError: if ``n_envs`` is less than 1, an argument of the environment is given twice, or ``vec_env_cls`` is no
+        class and another word
     """
     if n_envs < 1:
         raise ValueError(f"n_envs: {n_envs} given; accepted are whole numbers from 1 up")
@@ -159,6 +162,12 @@ def make_vec_env(
         raise ValueError(f"env_kwargs: {twice} given beside the same as an argument of its own; accepted is one or the other")
     kwargs = {**(env_kwargs or {}), **more_env_kwargs}
     kind = str(registered_spec(env_id).entry_point) if isinstance(env_id, str) else ""
+    if vec_env_cls == "ray":
+        vec_env_cls = RayVecEnv
+        if isinstance(env_id, str):
+            env_id = partial(gym.make, registered_spec(env_id))  # the machines do not know what was registered here
+    elif isinstance(vec_env_cls, str):
+        raise ValueError(f"vec_env_cls: {vec_env_cls!r} given; accepted are a class, and 'ray'")
     one_by_one = any(each is not None for each in (wrapper_class, vec_env_cls, vec_env_kwargs, monitor_kwargs, wrapper_kwargs))
     if one_by_one or not (kind in _VEC_ENVS or kind.startswith(_FRANKA)):
         return make_sb3_vec_env(

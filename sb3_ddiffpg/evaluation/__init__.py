@@ -1,5 +1,6 @@
 """Trained models put to the test: episodes, modes counted by ground truth, replanning."""
 
+from sb3_ddiffpg.evaluation.best_of import BestOf
 from sb3_ddiffpg.evaluation.ensemble import PolicyEnsemble, evaluate_ensemble
 from sb3_ddiffpg.evaluation.evaluate import clustering_agreement, evaluate_modes
 from sb3_ddiffpg.evaluation.replanner import Replanner
@@ -7,6 +8,7 @@ from sb3_ddiffpg.evaluation.results import CommandResult, ModeEvaluation, RouteR
 from sb3_ddiffpg.evaluation.rollout import EpisodeResult, run_episodes
 
 __all__ = [
+    "BestOf",
     "CommandResult",
     "EpisodeResult",
     "ModeEvaluation",

@@ -16,6 +16,7 @@ from torch.nn import functional as F
 TWIN_TARGETS = ("lower_mean", "elementwise")
 #: Row of everything that is kept by group: 0 explores, m + 1 is mode m
 EXPLORATORY_GROUP = 0
+ALL_GROUPS = slice(None)
 # Rows of a group from which on it pays on a processor to go back through the lower twin only
 LARGE_ASCENT = 128
 # What optimisers call the mean of the gradients
@@ -126,14 +127,27 @@ class ModeCritics(nn.Module):
             hidden = self.activation(layers[-1]) if len(layers) < len(parameters) else hidden
         return [layer.unflatten(0, (-1, self.n_critics)) for layer in layers]
 
-    def values(self, logits: th.Tensor) -> th.Tensor:
+    def values(self, logits: th.Tensor, groups: slice = ALL_GROUPS) -> th.Tensor:
         """
         :param logits: Output of ``forward``, shape [G, C, n, n_atoms]
+        :param groups: Which groups they are of
         :return: Expected values, shape [G, C, n]
         """
         if self.n_atoms == 1:
             return logits.squeeze(-1)
-        return (logits.softmax(dim=-1) * self.atoms[self._kind()][:, None, None, :]).sum(dim=-1)
+        return (logits.softmax(dim=-1) * self.atoms[self._kind()[groups]][:, None, None, :]).sum(dim=-1)
+
+    def values_by(self, groups: slice, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        :param groups: Which groups are asked, g of them
+        :param features: Observation features of n rows, which all of them judge, [n, F]
+        :param actions: Actions there, [n, A]
+        :return: Of each group the smaller of the twins' values, [g, n]
+        """
+        layers = zip(self.weights, self.biases, strict=True)
+        parameters = [(weight[groups].flatten(0, 1), bias[groups].flatten(0, 1)) for weight, bias in layers]
+        inputs = th.cat((features, actions), dim=1).expand(len(parameters[0][0]) // self.n_critics, -1, -1)
+        return self.values(self._layers(inputs, parameters)[-1], groups).min(dim=1).values
 
     @th.no_grad()
     def bellman_target(self, features: th.Tensor, actions: th.Tensor, rewards: th.Tensor, discounts: th.Tensor) -> th.Tensor:

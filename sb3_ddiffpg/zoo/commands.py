@@ -79,8 +79,8 @@ def commanded_to(mode: str | int) -> type[DDiffPG]:
 def train(arguments: Sequence[str]) -> None:
     """
     The zoo's training script. Beside its options it takes ``--n-envs N``, as ``--conf-file`` also the name of a file of ours,
-    ``--checkpoint-freq STEPS`` (0: no checkpoints), and ``--resume [FOLDER]``, which goes on with the newest run of this
-    algorithm and environment, or with the one in the folder.
+    ``--checkpoint-freq STEPS`` (0: no checkpoints), ``--vec-env ray`` for environments on a Ray cluster, and ``--resume
+    [FOLDER]``, which goes on with the newest run of this algorithm and environment, or with the one in the folder.
 
     :param arguments: Command line, without the name of the program
     """
@@ -91,6 +91,7 @@ def train(arguments: Sequence[str]) -> None:
     parser.add_argument("-f", "--log-folder", default="logs")
     parser.add_argument("--checkpoint-freq", type=int, default=CHECKPOINT_FREQ)
     parser.add_argument("--resume", nargs="?", const="")
+    parser.add_argument("--vec-env", choices=["dummy", "subproc", "ray"], default="dummy")
     known, rest = _read(parser, arguments)
     hyperparams = [*known.hyperparams, *([] if known.n_envs is None else [f"n_envs:{known.n_envs}"])]
     if hyperparams:
@@ -103,8 +104,9 @@ def train(arguments: Sequence[str]) -> None:
     if known.resume is not None and known.hyperparams:
         print("--resume: the run goes on with its own settings, not with what --hyperparams says")
     resume = None if known.resume is None else _run_folder(known.resume, known.log_folder, known.algo, known.env)
-    manager = partial(ModeExperimentManager, checkpoint_freq=known.checkpoint_freq, resume=resume)
-    rest += ["--log-folder", known.log_folder]
+    on_ray = known.vec_env == "ray"
+    manager = partial(ModeExperimentManager, checkpoint_freq=known.checkpoint_freq, resume=resume, on_ray=on_ray)
+    rest += ["--log-folder", known.log_folder, "--vec-env", "dummy" if on_ray else known.vec_env]
     try:
         rl_zoo3.train.ExperimentManager = manager  # type: ignore[assignment, misc]
         with _command_line([*([] if path is None else ["--conf-file", str(path)]), *rest]):

@@ -15,6 +15,7 @@ from sb3_ddiffpg.callbacks.checkpoint import RunCheckpointCallback
 from sb3_ddiffpg.common.schedules import LateLinearSchedule
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.envs.description import wrappers_said
+from sb3_ddiffpg.envs.vec_env.ray_actors import RayVecEnv
 from sb3_ddiffpg.envs.vec_env.tracing import TracingDummyVecEnv
 from sb3_ddiffpg.envs.vec_env.workers import WorkerVecEnv
 from sb3_ddiffpg.saving.algorithm import SavableAlgorithm
@@ -42,7 +43,9 @@ class ModeExperimentManager(ExperimentManager):
     package's algorithms with sampled actions: a deterministic evaluation would show one mode only.
     """
 
-    def __init__(self, *args: Any, checkpoint_freq: int = 0, resume: Path | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, checkpoint_freq: int = 0, resume: Path | None = None, on_ray: bool = False, **kwargs: Any
+    ) -> None:
         super().__init__(*args, **kwargs)
         self.checkpoint_freq, self.resume = checkpoint_freq, resume
         self.wrappers_said: list[dict[str, Any]] = []
@@ -53,7 +56,7 @@ class ModeExperimentManager(ExperimentManager):
             self.custom_hyperparams = one_by_one(ALGOS[self.algo], self.custom_hyperparams or {})
         # They say where an error was raised, and Ctrl-C does not end the workers
         better: dict[Any, Any] = {DummyVecEnv: TracingDummyVecEnv, SubprocVecEnv: WorkerVecEnv}
-        self.vec_env_class = better.get(self.vec_env_class, self.vec_env_class)
+        self.vec_env_class = RayVecEnv if on_ray else better.get(self.vec_env_class, self.vec_env_class)
         if resume is not None:
             self.continue_training = True  # with what ``_load_pretrained_agent`` gives
             self.save_path = str(resume)
@@ -109,7 +112,7 @@ class ModeExperimentManager(ExperimentManager):
         """
         env_id = self.env_name.gym_id
         wrapped = self.env_wrapper is not None or self.frame_stack is not None
-        if not is_ours(env_id) or wrapped or self.vec_env_class is WorkerVecEnv:
+        if not is_ours(env_id) or wrapped or self.vec_env_class in (WorkerVecEnv, RayVecEnv):
             wrapper = self.env_wrapper
             self.env_wrapper = partial(_spared, wrapper, self.wrappers_said)
             try:
