@@ -8,8 +8,8 @@ from sb3_ddiffpg.utils.nested_callbacks import nested_callbacks
 
 class ClusteringCallback(BaseCallback):
     """
-    Re-clusters the goal-reached trajectories every few rollouts, and says what became of the modes. ``DDiffPG.learn``
-    installs one by itself; pass one's own (or a subclass) to replace it.
+    Re-clusters the goal-reached trajectories every few rollouts, if an episode has ended since the time before, and says what
+    became of the modes. ``DDiffPG.learn`` installs one by itself; pass one's own (or a subclass) to replace it.
 
     The rollouts are counted by the model, so that a resumed run keeps the rhythm.
 
@@ -33,7 +33,9 @@ class ClusteringCallback(BaseCallback):
         model = self.model
         model.n_rollouts += 1  # type: ignore[attr-defined]
         frequency = self.recluster_freq or model.recluster_freq  # type: ignore[attr-defined]
-        if model.n_rollouts % frequency == 0:  # type: ignore[attr-defined]
+        # The same trajectories would tell nothing new, and a mode that they put in doubt would be doubted again and again
+        has_news = model.replay_buffer.n_finished != model.mode_manager.n_judged  # type: ignore[attr-defined]
+        if model.n_rollouts % frequency == 0 and has_news:  # type: ignore[attr-defined]
             self.on_recluster(model.recluster())  # type: ignore[attr-defined]
 
     def on_recluster(self, events: list[ModeEvent]) -> None:

@@ -44,6 +44,7 @@ class _State(msgspec.Struct, forbid_unknown_fields=True):
     history: Any
     next_number: Count
     success_is_told: bool = False
+    n_judged: Count = 0
 
 
 class ModeManager:
@@ -62,6 +63,8 @@ class ModeManager:
         self.next_number = 0
         #: Whether the environment itself has told of a success
         self.success_is_told = False
+        #: Trajectories that had been stored by the latest re-clustering
+        self.n_judged = 0
 
     def __len__(self) -> int:
         return len(self.modes)
@@ -99,7 +102,7 @@ class ModeManager:
         :param births: Whether modes may be born; the first always may
         :return: What happened: births, splits, merges and retirements
         """
-        self.success_is_told = buffer.goals_are_told
+        self.success_is_told, self.n_judged = buffer.goals_are_told, buffer.n_finished
         if self.success_is_told:
             retired = retired_modes(self.modes, self.settings.trials)
         else:
@@ -258,6 +261,7 @@ class ModeManager:
             "history": self.history.state_dict(),
             "next_number": self.next_number,
             "success_is_told": self.success_is_told,
+            "n_judged": self.n_judged,
         }
 
     def load_state_dict(self, state: Any) -> None:
@@ -269,5 +273,6 @@ class ModeManager:
         self.modes = modes_from_state(known.modes)
         self.history = ModeHistory.from_state(known.history)
         self.next_number, self.success_is_told = known.next_number, known.success_is_told
+        self.n_judged = known.n_judged
         if any(mode.number >= self.next_number for mode in self.modes):
             raise ValueError(f"modes: one has a number that is not below {self.next_number}, the next one's")

@@ -1,5 +1,7 @@
 """What SB3's own tests ask of an off-policy algorithm such as TD3, asked of DDiffPG."""
 
+from itertools import pairwise
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -269,6 +271,31 @@ def test_own_clustering_callback_replaces_the_built_in_one(nested):
     # The count of rollouts is the model's: a second run keeps the rhythm
     model.learn(20, callback=own, reset_num_timesteps=False)
     assert [step for step, _ in own.at] == [30, 60, 90, 120]
+
+
+def test_nothing_is_clustered_twice():
+    """One environment, episodes of up to 8 steps: only where one has ended since the time before."""
+    ends, own = [], Reports(3)
+
+    class Watch(BaseCallback):
+        def _on_step(self):
+            if self.locals["dones"].any():
+                ends.append(self.num_timesteps)
+            return True
+
+    model = small_model(TwoEnds(), train_freq=1, learning_starts=10_000)
+    model.learn(200, callback=[own, Watch()])
+    times = [0, *range(3, 201, 3)]
+    expected = [now for before, now in pairwise(times) if any(before < end <= now for end in ends)]
+    assert [step for step, _ in own.at] == expected and len(expected) < len(times) - 10
+    # That it was is known after saving too
+    state = model.mode_manager.state_dict()
+    assert state["n_judged"] == model.replay_buffer.n_finished
+    other = small_model(TwoEnds())
+    other.mode_manager.load_state_dict(state)
+    assert other.mode_manager.n_judged == state["n_judged"]
+    # Asked for, it is done
+    model.recluster()
 
 
 def test_built_in_clustering_runs_first_and_says_what_happened(capsys):
