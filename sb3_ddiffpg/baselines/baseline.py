@@ -23,6 +23,7 @@ class FifoReplayBuffer(ModeReplayBuffer):
     """A ``ModeReplayBuffer`` without modes and target actions: the trajectory that ended first is the first to go."""
 
     target_action_fields: tuple[str, ...] = ()
+    relabels_goals = False
 
     def _insert(self, trajectory: Trajectory) -> None:
         self.groups.retired.append(trajectory)

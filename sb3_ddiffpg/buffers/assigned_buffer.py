@@ -33,6 +33,8 @@ class AssignedReplayBuffer(PathReplayBuffer):
 
     #: Stored beside each action, for algorithms that improve them: of the mode that owns it, and of the exploratory group
     target_action_fields: tuple[str, ...] = ("target_actions", "exploratory_target_actions")
+    #: Whether trajectories are told of other goals, for algorithms that have modes
+    relabels_goals: bool = True
     target_actions: Any
     exploratory_target_actions: Any
     off_mode_success: np.ndarray
@@ -84,7 +86,7 @@ class AssignedReplayBuffer(PathReplayBuffer):
         :param env: The environments
         """
         super().claim(env)
-        self.hindsight = Hindsight.of(env)
+        self.hindsight = Hindsight.of(env) if self.relabels_goals else None
         if self.hindsight is not None:
             self.hindsight.judge(self)
 

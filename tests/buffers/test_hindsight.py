@@ -14,6 +14,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_ddiffpg import DDiffPG, check_env
+from sb3_ddiffpg.baselines import TD3C51
 from sb3_ddiffpg.buffers.hindsight import Hindsight
 from sb3_ddiffpg.envs.vec_env import WorkerVecEnv
 
@@ -83,6 +84,17 @@ def with_modes(**kwargs):
 
 def distance(a, b):
     return np.linalg.norm(a - b, axis=-1)
+
+
+def test_who_has_no_modes_relabels_nothing():
+    """And is not told of rewards that do not follow from goals."""
+    env, settings = DummyVecEnv([lambda: AnyGoal(extra=0.5)]), {"learning_starts": 10_000, "device": "cpu"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        model = TD3C51("MultiInputPolicy", env, critic={"v_min": -100.0, "v_max": 100.0}, **settings)
+        model.set_logger(Logger(None, []))
+        model.learn(100)
+    assert model.replay_buffer.hindsight is None and not model.replay_buffer.has_hindsight
 
 
 def test_no_return_stands_in_for_a_goal_where_other_goals_can_be_learned_from():
