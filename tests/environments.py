@@ -1,5 +1,7 @@
 """Tiny environments, models and hand-made trajectories, shared by tests."""
 
+import os
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -82,6 +84,24 @@ class TwoEnds(gym.Env):
         reached = abs(self.x) >= 1
         info = {} if self.success_key is None else {self.success_key: reached}
         return self._observation(), float(reached), reached, self.steps >= self.limit, info
+
+
+class Fragile(TwoEnds):
+    """Raises, dies or hangs, when it is told to."""
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        if abs(action[0]) > 0.99:
+            raise ZeroDivisionError("broken leg")
+        return super().step(action)
+
+    def die(self) -> None:
+        os._exit(3)
+
+    def hang(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+    def pid(self) -> int:
+        return os.getpid()
 
 
 class KnownEnds(TwoEnds):

@@ -3,14 +3,13 @@
 import os
 import signal
 import sys
-import time
 import warnings
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import AnySpaces, TwoEnds, image_dict_space, small_model
+from environments import AnySpaces, Fragile, TwoEnds, image_dict_space, small_model
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg.buffers.trajectory import NO_MODE
@@ -18,21 +17,6 @@ from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.envs.vec_env import RayVecEnv
 
 ray = pytest.importorskip("ray")
-
-
-class Fragile(TwoEnds):
-    """Raises, dies or hangs, when it is told to."""
-
-    def step(self, action):
-        if abs(action[0]) > 0.99:
-            raise ZeroDivisionError("broken leg")
-        return super().step(action)
-
-    def pid(self):
-        return os.getpid()
-
-    def hang(self, seconds):
-        time.sleep(seconds)
 
 
 @pytest.fixture(scope="module", autouse=True)

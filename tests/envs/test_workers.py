@@ -11,26 +11,11 @@ import time
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import AnySpaces, TwoEnds, image_dict_space, small_model
+from environments import AnySpaces, Fragile, TwoEnds, image_dict_space, small_model
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.envs.vec_env.workers import WorkerVecEnv, _end
-
-
-class Fragile(TwoEnds):
-    """Raises, or dies, when it is told to."""
-
-    def step(self, action):
-        if abs(action[0]) > 0.99:
-            raise ZeroDivisionError("broken leg")
-        return super().step(action)
-
-    def die(self):
-        os._exit(3)
-
-    def hang(self, seconds):
-        time.sleep(seconds)
 
 
 @pytest.fixture

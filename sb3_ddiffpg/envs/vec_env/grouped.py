@@ -77,6 +77,27 @@ class GroupedVecEnv(VecEnv):
     def _hear(self) -> list[Any]:
         """What each group has answered to the latest command."""
 
+    @abstractmethod
+    def _who(self, group: int, turn: int = NOBODY) -> str:
+        """A group, or the one of its environments whose turn it is, for messages."""
+
+    def _results(self, answers: Sequence[tuple[str, Any]]) -> list[Any]:
+        """
+        Of each group what it has found, or the error that one has met.
+
+        :param answers: ``("ok", result)``, or ``("error", (environment, lacks, text))``, where ``lacks`` says whether it was
+            an AttributeError, after which all go on
+        """
+        for group, (status, result) in enumerate(answers):
+            if status == "error":
+                env, lacks, text = result
+                message = f"{self._who(group, env)} raised an error:\n{text}"
+                if lacks:
+                    raise AttributeError(message)
+                self.close()
+                raise RuntimeError(message)
+        return [result for _, result in answers]
+
     def _ask(self, command: str, arguments: Sequence[Any]) -> list[Any]:
         self._tell(command, arguments)
         return self._hear()

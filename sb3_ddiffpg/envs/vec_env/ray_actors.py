@@ -109,16 +109,7 @@ class RayVecEnv(GroupedVecEnv):
 
     def _hear(self) -> list[Any]:
         asked, self._asked = self._asked, []
-        answers = [self._hear_one(group, *each) for group, each in enumerate(asked)]
-        for group, (status, result) in enumerate(answers):
-            if status == "error":
-                env, lacks, text = result
-                message = f"{self._who(group, env)} raised an error:\n{text}"
-                if lacks:
-                    raise AttributeError(message)
-                self.close()
-                raise RuntimeError(message)
-        results = [result for _, result in answers]
+        results = self._results([self._hear_one(group, *each) for group, each in enumerate(asked)])
         for group, result in enumerate(results):
             if asked[group][0] in ("reset", "step"):
                 self._seen[group] = result[0]

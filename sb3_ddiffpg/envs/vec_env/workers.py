@@ -137,16 +137,7 @@ class WorkerVecEnv(GroupedVecEnv):
                 self._fail(worker)
 
     def _hear(self) -> list[Any]:
-        answers = [self._hear_one(worker) for worker in range(len(self.remotes))]
-        for worker, (status, result) in enumerate(answers):
-            if status == "error":
-                env, lacks, text = result
-                message = f"{self._who(worker, env)} raised an error:\n{text}"
-                if lacks:
-                    raise AttributeError(message)
-                self.close()
-                raise RuntimeError(message)
-        return [result for _, result in answers]
+        return self._results([self._hear_one(worker) for worker in range(len(self.remotes))])
 
     def _hear_one(self, worker: int) -> tuple[str, Any]:
         remote = self.remotes[worker]
