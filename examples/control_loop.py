@@ -26,9 +26,9 @@ class Policy:
         self.session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
         self.about = {key: json.loads(value) for key, value in self.session.get_modelmeta().custom_metadata_map.items()}
         self.names = [mode["name"] for mode in self.about["modes"]]
-        shapes = {each.name: each.shape for each in self.session.get_inputs()}
-        self.chooses = "mode" in shapes
-        self.noise = np.zeros((1, *shapes["noise"][1:]), np.float32)  # no noise: the same observation, the same action
+        self.chooses = "mode" in {each.name for each in self.session.get_inputs()}
+        # Always the same noise: the same observation, the same action. Of four actions the mode's critics choose one
+        self.noise = np.array(self.about["deterministic_noise"], np.float32)[None]
 
     def __call__(self, observation: dict[str, np.ndarray], mode: str | None = None) -> np.ndarray:
         """

@@ -83,10 +83,10 @@ class Hindsight:
         rows = buffer.stored_rows.spread(_LOOKED_AT)
         if not len(rows):
             return
-        achieved, desired = (_part(buffer.nexts, name, rows) for name in (_ACHIEVED_NEXT, _DESIRED_NEXT))
-        if np.ptp(desired, axis=0).max() <= _SAME * np.ptp(achieved, axis=0).max():
+        if not goals_differ(buffer):
             self.in_use = False
             return
+        achieved, desired = (_part(buffer.nexts, name, rows) for name in (_ACHIEVED_NEXT, _DESIRED_NEXT))
         alike = np.isclose(self.rewards(achieved, desired), buffer.rewards[rows], rtol=1e-3, atol=1e-5)
         self.in_use = bool(1 - alike.mean() <= _MOST_OTHERS)
         if not self.in_use and not self._warned:
@@ -141,6 +141,18 @@ class Hindsight:
         window[reached.cumsum(axis=1) > reached] = -1
         windows[chosen], notes[chosen] = window, note
         return Relabelling(chosen, goals)
+
+
+def goals_differ(buffer: Any) -> bool:
+    """
+    :param buffer: A ``ModeReplayBuffer``
+    :return: Whether episodes that are stored have other goals, beyond a sensor's noise
+    """
+    space, rows = buffer.observation_space, buffer.stored_rows.spread(_LOOKED_AT)
+    if not (isinstance(space, spaces.Dict) and {ACHIEVED, DESIRED} <= set(space.spaces) and len(rows)):
+        return False
+    achieved, desired = (_part(buffer.nexts, name, rows) for name in (_ACHIEVED_NEXT, _DESIRED_NEXT))
+    return bool(np.ptp(desired, axis=0).max() > _SAME * np.ptp(achieved, axis=0).max())
 
 
 def _part(part: Any, field: str, rows: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from sb3_ddiffpg.utils.vec_envs import route_label
 
 SUCCESS_KEYS = ("is_success", "success")
+NO_KEY = "is not in an episode's last info"
 # So much alike are names of which one may be a misspelling of the other
 CLOSE = 0.8
 #: Of the returns seen lately, while nobody has told a success
@@ -175,16 +176,16 @@ class SuccessRule(GoalWatch):
     def check_key(self, info: dict[str, Any]) -> None:
         """
         :param info: Of an episode's last step
-        :raises ValueError: If ``success_key`` was given, no step has had it yet, and this one says it by another name, or by
-            one that it may be a misspelling of
+        :raises ValueError: If ``success_key`` was given, no step has had it yet, and this one has a key that it may be a
+            misspelling of
         """
         if self.has_key or self.success_key is None:
             return
-        complaint = f"success_key={self.success_key!r} is not in an episode's last info; its keys: {sorted(info)}"
-        if any(key in info for key in SUCCESS_KEYS):
-            raise ValueError(complaint)
+        complaint = f"success_key={self.success_key!r} {NO_KEY}; its keys: {sorted(info)}"
         if alike := get_close_matches(self.success_key, [key for key in info if isinstance(key, str)], 1, CLOSE):
             raise ValueError(f"{complaint}; did you mean {alike[0]!r}?")
         if not self._warned:
             self._warned = True
-            warnings.warn(f"{complaint}. Episodes count as failures until one has it")
+            told = [key for key in SUCCESS_KEYS if key in info] or get_close_matches(self.success_key, SUCCESS_KEYS, 1, CLOSE)
+            hint = f"; without success_key, {told[0]!r} would be it" if told else ""
+            warnings.warn(f"{complaint}. Episodes count as failures until one has it, as where it is told only if True{hint}")

@@ -211,20 +211,20 @@ class EnvCheck:
         if signal.stands_in and signal.n_counted:
             lines.append(f"until one does, the best fifth of the returns stands in for it ({counted})")
         if self.relabels is not None:
-            differ = "modes also learn from each episode as if the goal had been where it went"
-            lines.append(
-                f"goals differ between episodes: {differ}" if self.relabels else "all episodes learn from their own goal only"
-            )
+            also = "modes also learn from each episode as if the goal had been where it went"
+            only = "no compute_reward for arrays of goals gives the rewards that were met, so each episode learns from its own"
+            lines.append(f"goals differ between episodes: {also if self.relabels else only}")
         return lines
 
     def _of_features(self) -> list[str]:
         features = self.features
+        reached = "the best" if self.success.stands_in else "goal-reached"
         reason = {
             "given": "as given",
             "declared": "declared by the environment",
             "achieved_goal": "the achieved_goal of a goal environment",
             "whole": "the whole observation",
-            "found": "found: goal-reached episodes part along them" if features.parting else "found: they go farthest",
+            "found": f"found: {reached} episodes part along them" if features.parting else "found: they go farthest",
         }[features.source]
         lines = [
             f"{_selected(features)}, {reason}",

@@ -19,9 +19,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 from sb3_ddiffpg.buffers.feature_choice import travels
 from sb3_ddiffpg.buffers.features import ModeFeatures, declared_mode_features
-from sb3_ddiffpg.buffers.hindsight import METHOD
+from sb3_ddiffpg.buffers.hindsight import METHOD, goals_differ
 from sb3_ddiffpg.buffers.returns import discounted_returns
-from sb3_ddiffpg.buffers.success import SUCCESS_KEYS, GoalWatch, read_success
+from sb3_ddiffpg.buffers.success import NO_KEY, SUCCESS_KEYS, GoalWatch, read_success
 from sb3_ddiffpg.check.findings import Cells, ChosenFeatures, EnvCheck, SuccessSignal
 from sb3_ddiffpg.common.scales import may_choose, review_scales, settle_features
 from sb3_ddiffpg.ddiffpg.ddiffpg import DDiffPG
@@ -168,7 +168,7 @@ def _probe(
         limit=limit or max(listener.cut_off, default=None),
         declared_limit=limit is not None,
         success=_success(model, listener),
-        relabels=None if hindsight is None else hindsight.in_use,
+        relabels=_relabels(model),
         features=by_episodes.features(parting),
         cells=by_episodes.cells(caught),
         rewards=by_episodes.rewards,
@@ -178,7 +178,7 @@ def _probe(
         listed=tuple(map(str, env_attribute(walked, "listed_modes") or ())),
         labels=dict(listener.labels),
         wrappers=tuple(_changing_wrappers(walked)),
-        warned=tuple(_warned(caught, given, env, env_kwargs)),
+        warned=tuple(_warned(caught, given, env, env_kwargs, model.replay_buffer.success_rule.has_key)),
         code=_code(given, policy, env_kwargs, arguments, model.replay_buffer.success_rule.has_key),
     )
 
@@ -278,6 +278,12 @@ def _success(model: DDiffPG, listener: _Listener) -> SuccessSignal:
     )
 
 
+def _relabels(model: DDiffPG) -> bool | None:
+    """Whether other goals are learned from; None where goals do not differ, or there are none."""
+    buffer = model.replay_buffer
+    return buffer.has_hindsight if goals_differ(buffer) else None
+
+
 def policy_for(space: spaces.Space) -> str:
     """
     :param space: Of observations
@@ -349,9 +355,11 @@ def _text(space: spaces.Space) -> str:
     return f"{tuple(map(int, space.shape))} numbers in [{low:.4g}, {high:.4g}]{kind}"
 
 
-def _warned(caught: list[warnings.WarningMessage], given: Any, env: Any, env_kwargs: dict[str, Any]) -> Iterator[str]:
+def _warned(
+    caught: list[warnings.WarningMessage], given: Any, env: Any, env_kwargs: dict[str, Any], key_was_told: bool
+) -> Iterator[str]:
     """What was warned of, and what SB3's checker says of a single environment."""
-    texts = [str(each.message) for each in caught if _matters(each)]
+    texts = [str(each.message) for each in caught if _matters(each) and not (key_was_told and NO_KEY in str(each.message))]
     before = len(caught)
     single = gym.make(given, **env_kwargs) if isinstance(given, str) else env
     if isinstance(single, gym.Env):

@@ -454,7 +454,7 @@ class DDiffPG(ActorCriticAlgorithm):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
         mode: str | int | list[str | int] | np.ndarray | None = None,
-        n_samples: int = 1,
+        n_samples: int | None = None,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
         Actions for one observation or a batch of them.
@@ -462,12 +462,13 @@ class DDiffPG(ActorCriticAlgorithm):
         :param observation: The observation(s)
         :param state: What the previous call returned: the mode that every environment follows
         :param episode_start: Which environments begin an episode
-        :param deterministic: Zero initial latent and no sampling noise: the same call returns the same action
+        :param deterministic: Without chance: the same call returns the same action
         :param mode: Name or index of the mode to follow, or one for each observation. None: a mode is drawn for each episode
             and kept through it by ``state`` and ``episode_start``; without those, the zero embedding, which leaves the
             choice to the policy at every step
         :param n_samples: Of so many actions for each observation take that which the mode's critics like best (without a mode,
-            those of any). One of them has no noise, and where ``deterministic`` the others always have the same
+            those of any). One of them has no noise, and where ``deterministic`` the others always have the same. None: 4 where
+            ``deterministic``, else 1
         :return: The actions and the state for the next call
         :raises ValueError: If there is no such mode, or ``n_samples`` is less than 1
         """
@@ -545,11 +546,12 @@ class DDiffPG(ActorCriticAlgorithm):
     def export_onnx(self, path: str | os.PathLike, mode: str | int | Mode | None = None) -> None:
         """
         Save the policy as one ONNX file, which acts without torch and this package, see ``docs/deployment.md``. Its inputs are
-        ``observation`` (of a dict one for each key, ``observation.KEY``) as the environment gives it, [N, ...];
-        ``mode``, the index of each row's mode or -1 for none, int64, [N]; and ``noise``, standard normal, or 0 to act as
-        ``predict(deterministic=True)``, float32, [N, T, action_dim]. Its output is ``action``, [N, ...], in the environment's
-        units. What ``VecNormalize`` does to observations is inside, if the model has its environments. Images are as the model
-        sees them, channels first. The file is tried with onnxruntime before it is written.
+        ``observation`` (of a dict one for each key, ``observation.KEY``) as the environment gives it, [N, ...]; ``mode``, the
+        index of each row's mode or -1 for none, int64, [N]; and ``noise``, float32, [N, K, T, action_dim], of which K actions
+        are made: that which the mode's critics like best is the output, ``action``, [N, ...], in the environment's units. Noise
+        is standard normal, or what the file says, to act as ``predict(deterministic=True)``. What ``VecNormalize`` does to
+        observations is inside, if the model has its environments. Images are as the model sees them, channels first. The file
+        is tried with onnxruntime before it is written.
 
         :param path: Path to the file
         :param mode: Name or index of the only mode, which is then no input; None: all

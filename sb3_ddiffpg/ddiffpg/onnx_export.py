@@ -2,9 +2,12 @@
 
 import copy
 import json
+import logging
 import math
 import os
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_ddiffpg.networks.diffusion import DiffusionActor
+from sb3_ddiffpg.ddiffpg.policies import DETERMINISTIC_SAMPLES, DiffusionPolicy
+from sb3_ddiffpg.networks.critics import ALL_GROUPS
 from sb3_ddiffpg.utils.rng import preserved_rng
 
 #: Of an output that onnxruntime gives beside that of torch, actions in [-1, 1]
@@ -53,10 +57,10 @@ class _Normalization(nn.Module):
 
 class PolicyGraph(nn.Module):
     """
-    From observations as the environment gives them, a mode and noise to actions in the environment's units.
+    From observations as the environment gives them, a mode and noise to actions in the environment's units: of K for each
+    observation that which the mode's critics like best.
 
-    :param actor: The policy
-    :param embeddings: One for each mode, [M, mode_embedding_dim]
+    :param policy: A ``DiffusionPolicy``
     :param normalizer: Of the observations that the policy was trained on; None: they are as they are
     :param mode: Index of the only mode; None: the mode is an input
     """
@@ -65,14 +69,14 @@ class PolicyGraph(nn.Module):
     low: th.Tensor
     range: th.Tensor
 
-    def __init__(
-        self, actor: DiffusionActor, embeddings: th.Tensor, normalizer: VecNormalize | None, mode: int | None = None
-    ) -> None:
+    def __init__(self, policy: DiffusionPolicy, normalizer: VecNormalize | None, mode: int | None = None) -> None:
         super().__init__()
-        self.actor, self.mode = actor, mode
+        self.actor, self.critics, self.mode = policy.actor, policy.critics, mode
+        self.critic_features_extractor, self.n_modes = policy.critic_features_extractor, policy.n_modes
+        embeddings = policy.mode_embeddings[1:]
         nobody = embeddings.new_zeros(1, embeddings.shape[1])  # no mode leaves the choice to the policy
         self.register_buffer("embeddings", th.cat((nobody, embeddings)).clone())
-        space: Any = actor.action_space
+        space: Any = policy.action_space
         self.register_buffer("low", th.as_tensor(space.low))
         self.register_buffer("range", th.as_tensor(space.high - space.low))
         self.normalizations = nn.ModuleDict()
@@ -85,21 +89,28 @@ class PolicyGraph(nn.Module):
         """
         :param observations: By key, ``"observation"`` alone where they are no dict, each [N, ...]
         :param mode: Index of each row's mode, -1 for none, int64, [N]; None where the mode is no input
-        :param noise: Standard normal, or 0 to act as ``predict(deterministic=True)``, [N, T, action_dim]
+        :param noise: What is denoised, [N, K, T, action_dim]
         :return: Actions, [N, *action_space.shape]
         """
+        n, n_samples = noise.shape[:2]
         seen = {
             key: self.normalizations[key](each) if key in self.normalizations else each for key, each in observations.items()
         }
         is_dict = isinstance(self.actor.observation_space, spaces.Dict)
         if mode is None:
             index = -1 if self.mode is None else self.mode
-            embeddings = self.embeddings[index + 1].expand(noise.shape[0], -1)
-        else:
-            embeddings = self.embeddings[mode + 1]
-        condition = self.actor.condition(seen if is_dict else seen[OBSERVATION], embeddings)
-        actions = self.actor.diffusion.denoise(condition, noise=noise.transpose(0, 1))
-        return self.low + 0.5 * (actions.unflatten(1, self.low.shape) + 1.0) * self.range
+            mode = th.full((n,), index, device=noise.device)
+        obs = seen if is_dict else seen[OBSERVATION]
+        condition = self.actor.condition(obs, self.embeddings[mode + 1])
+        features = self.actor.extract_features(obs, self.critic_features_extractor)
+        condition, features = (each[:, None].expand(-1, n_samples, -1).flatten(0, 1) for each in (condition, features))
+        actions = self.actor.diffusion.denoise(condition, noise=noise.flatten(0, 1).transpose(0, 1))
+        values = self.critics.values_by(ALL_GROUPS, features, actions).unflatten(1, (n, n_samples))  # [G, N, K]
+        anybody = values[1:].amax(dim=0) if self.n_modes else values[0]
+        own = values.gather(0, (mode + 1).clamp(min=0)[None, :, None].expand(1, n, n_samples))[0]
+        best = th.where((mode < 0)[:, None], anybody, own).argmax(dim=1)
+        chosen = actions.unflatten(0, (n, n_samples)).gather(1, best[:, None, None].expand(n, 1, actions.shape[1]))[:, 0]
+        return self.low + 0.5 * (chosen.unflatten(1, self.low.shape) + 1.0) * self.range
 
 
 class _SiLU(nn.Module):
@@ -121,12 +132,12 @@ class _Mish(nn.Module):
 _EXACT: dict[type[nn.Module], type[nn.Module]] = {nn.SiLU: _SiLU, nn.Mish: _Mish}
 
 
-def with_exact_activations(actor: DiffusionActor) -> DiffusionActor:
+def with_exact_activations(graph: PolicyGraph) -> PolicyGraph:
     """
-    :param actor: A policy
+    :param graph: A policy
     :return: A copy, which onnxruntime computes as exactly as torch
     """
-    copied = copy.deepcopy(actor, {id(actor.optimizer): None})
+    copied = copy.deepcopy(graph, {id(part.optimizer): None for part in (graph.actor, graph.critics)})
     for module in list(copied.modules()):
         for name, child in list(module.named_children()):
             if type(child) in _EXACT:
@@ -165,10 +176,9 @@ def export_onnx(model: Any, path: str | os.PathLike, mode: int | None = None) ->
     policy = model.policy
     policy.set_training_mode(False)
     with preserved_rng():
-        others = policy.mode_embeddings[1:], model.get_vec_normalize_env(), mode
-        graph = PolicyGraph(policy.actor, *others)
-        inputs = _example(graph, n_modes=policy.n_modes)
-        content = _exported(PolicyGraph(with_exact_activations(policy.actor), *others), inputs)
+        graph = PolicyGraph(policy, model.get_vec_normalize_env(), mode)
+        inputs = _example(graph)
+        content = _exported(with_exact_activations(graph), inputs)
         for key, value in _metadata(model, mode).items():
             content.model.metadata_props[key] = value
         path = Path(path)
@@ -181,7 +191,7 @@ def export_onnx(model: Any, path: str | os.PathLike, mode: int | None = None) ->
             unfinished.unlink(missing_ok=True)
 
 
-def _example(graph: PolicyGraph, n_modes: int) -> dict[str, th.Tensor]:
+def _example(graph: PolicyGraph, n_samples: int = 2) -> dict[str, th.Tensor]:
     """Inputs of the file, by name, in their order."""
     space, diffusion = graph.actor.observation_space, graph.actor.diffusion
     parts = space.spaces if isinstance(space, spaces.Dict) else {None: space}
@@ -190,8 +200,8 @@ def _example(graph: PolicyGraph, n_modes: int) -> dict[str, th.Tensor]:
         drawn = np.stack([np.asarray(part.sample()) for _ in range(N_TRIED)]).astype(part.dtype)
         inputs[OBSERVATION if key is None else f"{OBSERVATION}.{key}"] = th.as_tensor(drawn)
     if graph.mode is None:
-        inputs[MODE] = th.arange(N_TRIED) % (n_modes + 1) - 1
-    inputs[NOISE] = th.randn(N_TRIED, diffusion.n_steps, diffusion.denoiser.action_in.in_features)
+        inputs[MODE] = th.arange(N_TRIED) % (graph.n_modes + 1) - 1
+    inputs[NOISE] = th.randn(N_TRIED, n_samples, diffusion.n_steps, diffusion.denoiser.action_in.in_features)
     return inputs
 
 
@@ -200,24 +210,44 @@ def _keys(inputs: dict[str, th.Tensor]) -> list[str]:
 
 
 def _exported(graph: PolicyGraph, inputs: dict[str, th.Tensor]) -> Any:
-    device = graph.low.device
-    rows = {0: th.export.Dim("n", min=1)}
+    rows, samples = th.export.Dim("n", min=1), th.export.Dim("k", min=1)
+    shapes: list[dict[int, Any]] = [{0: rows} for _ in inputs]
+    shapes[-1] = {0: rows, 1: samples}
+    with warnings.catch_warnings(), _quiet("torch.onnx"):
+        warnings.simplefilter("ignore")  # of what it has installed, and of names of axes
+        return _export(graph, inputs, shapes)
+
+
+def _export(graph: PolicyGraph, inputs: dict[str, th.Tensor], shapes: list[dict[int, Any]]) -> Any:
     return th.onnx.export(
         _Flat(graph, _keys(inputs)).eval(),
-        tuple(each.to(device) for each in inputs.values()),
+        tuple(each.to(graph.low.device) for each in inputs.values()),
         input_names=list(inputs),
         output_names=[ACTION],
-        dynamic_shapes=((rows,) * len(inputs),),
+        dynamic_shapes=(tuple(shapes),),
         dynamo=True,
         verbose=False,
         external_data=False,
     )
 
 
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
 def _compare(graph: PolicyGraph, inputs: dict[str, th.Tensor], path: Path) -> None:
     import onnxruntime
 
     session = onnxruntime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
+    # One action each: two that are liked alike could change places by a rounding
+    inputs = {**inputs, NOISE: inputs[NOISE][:, :1]}
     (found,) = session.run([ACTION], {name: each.numpy() for name, each in inputs.items()})
     with th.no_grad():
         expected = _Flat(graph, _keys(inputs))(*(each.to(graph.low.device) for each in inputs.values())).cpu().numpy()
@@ -248,6 +278,7 @@ def _metadata(model: Any, mode: int | None) -> dict[str, str]:
         "observation_space": _space(model.observation_space),
         "action_space": _space(model.action_space),
         "n_diffusion_steps": model.policy.actor.n_diffusion_steps,
+        "deterministic_noise": model.policy.fixed_noise(DETERMINISTIC_SAMPLES).transpose(0, 1).tolist(),
     }
     return {key: json.dumps(value, allow_nan=False) for key, value in said.items()}
 

@@ -16,6 +16,9 @@ from sb3_ddiffpg.networks.diffusion import DiffusionActor
 from sb3_ddiffpg.networks.policies import TwinCriticPolicy
 from sb3_ddiffpg.utils.observations import batch_size, repeated
 
+#: Actions among which the critics choose where a policy is to act without chance
+DETERMINISTIC_SAMPLES = 4
+
 
 class _Command(NamedTuple):
     """What ``predict`` is asked for: the group of each row, and how many actions are drawn for each."""
@@ -235,6 +238,18 @@ class DiffusionPolicy(TwinCriticPolicy):
             return self.actor(observation, deterministic, embeddings)
         return self.best_actions(observation, groups, n_samples, deterministic)
 
+    def fixed_noise(self, n_samples: int) -> th.Tensor:
+        """
+        :param n_samples: Actions for each observation
+        :return: What is denoised where a policy is to act without chance, the same at each call: nothing, and standard normal
+            draws, [T, n_samples, action_dim]
+        """
+        diffusion = self.actor.diffusion
+        shape = (diffusion.n_steps, n_samples, diffusion.denoiser.action_in.in_features)
+        noise = th.randn(shape, generator=th.Generator().manual_seed(0))  # on the CPU: other devices draw otherwise
+        noise[:, 0] = 0.0
+        return noise.to(self.mode_embeddings.device)
+
     @th.no_grad()
     def best_actions(
         self, obs: PyTorchObs, groups: np.ndarray | None, n_samples: int, deterministic: bool = False
@@ -253,11 +268,13 @@ class DiffusionPolicy(TwinCriticPolicy):
         groups = np.full(n, UNCONDITIONED) if groups is None else groups
         condition = self.actor.condition(obs, self.group_embeddings(groups))
         diffusion = self.actor.diffusion
-        shape = (diffusion.n_steps, 1 if deterministic else n, n_samples, diffusion.denoiser.action_in.in_features)
-        generator = th.Generator(condition.device).manual_seed(0) if deterministic else None
-        noise = th.randn(shape, generator=generator, device=condition.device)
-        noise[:, :, 0] = 0.0
-        noise = noise.expand(-1, n, -1, -1).flatten(1, 2)
+        if deterministic:
+            noise = self.fixed_noise(n_samples)[:, None].expand(-1, n, -1, -1)
+        else:
+            shape = (diffusion.n_steps, n, n_samples, diffusion.denoiser.action_in.in_features)
+            noise = th.randn(shape, device=condition.device)
+            noise[:, :, 0] = 0.0
+        noise = noise.flatten(1, 2)
         actions = diffusion.sample(condition.repeat_interleave(n_samples, 0), noise=noise).unflatten(0, (n, n_samples))
         features = self.extract_features(obs, self.critic_features_extractor)
         best = actions.new_empty(n, dtype=th.long)
@@ -277,7 +294,7 @@ class DiffusionPolicy(TwinCriticPolicy):
         deterministic: bool = False,
         mode: int | np.ndarray | None = None,
         group: np.ndarray | None = None,
-        n_samples: int = 1,
+        n_samples: int | None = None,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
         Actions for one observation or a batch.
@@ -303,6 +320,8 @@ class DiffusionPolicy(TwinCriticPolicy):
             if held.max(initial=UNCONDITIONED) >= self.n_modes:
                 raise ValueError(f"mode={held.max()} (or the one in state) is unknown; this policy has {self.n_modes} modes")
             group = np.where(held < 0, UNCONDITIONED, held + 1)
+        if n_samples is None:
+            n_samples = DETERMINISTIC_SAMPLES if deterministic else 1
         if not isinstance(n_samples, int | np.integer) or n_samples < 1:
             raise ValueError(f"n_samples: {n_samples!r} given; accepted are whole numbers from 1 up")
         self._command = _Command(None, int(n_samples))

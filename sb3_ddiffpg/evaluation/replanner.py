@@ -28,7 +28,8 @@ class Replanner:
     :param model: A trained model with modes
     :param patience: Steps without movement after which a mode has failed
     :param tolerance: Distance, in units of the features, that counts as movement. None: two mean steps of the modes' own
-        routes, since a stochastic policy trembles where it is stuck
+        routes, since a stochastic policy trembles where it is stuck; of modes that have none yet, two of the longest steps
+        that were seen so far
     :param order: In which order modes are tried: ``"value"``, by the return that each mode's critics expect from where the
         agent is then; ``"return"``, by the discounted return that each had in training; or names
     :param normalizer: Statistics by which the observations are normalised; those of the model's environment when None
@@ -59,8 +60,10 @@ class Replanner:
         self.success_key = model.success_key
         self.resolved_features = model.resolved_features if features is None else features
         self.features = ModeFeatures(model.observation_space, self.resolved_features)
-        self.tolerance = 2 * self._mean_step() if tolerance is None else tolerance
-        if not self.tolerance > 0:
+        #: None: nothing has moved yet that would tell it
+        self.tolerance = self._from_routes() if tolerance is None else tolerance
+        self._follows = self.tolerance is None
+        if self.tolerance is not None and not self.tolerance > 0:
             raise ValueError(f"tolerance: {self.tolerance} given; accepted are positive numbers")
         self.by_value = order == "value"
         if isinstance(order, str) and order not in ("return", "value"):
@@ -72,11 +75,11 @@ class Replanner:
         self.ranked = np.array(ranked)
         self._numbers = [mode.number for mode in model.modes]
 
-    def _mean_step(self) -> float:
+    def _from_routes(self) -> float | None:
         routes = [mode.representative for mode in self.model.modes if len(mode.representative) > 1]
-        if not routes:
-            raise ValueError("tolerance: None given, but the modes have no route yet that would tell it")
-        return float(np.mean(np.concatenate([np.linalg.norm(np.diff(route, axis=0), axis=1) for route in routes])))
+        if not routes:  # as of modes that have learned from other goals than they were given
+            return None
+        return 2 * float(np.mean(np.concatenate([np.linalg.norm(np.diff(route, axis=0), axis=1) for route in routes])))
 
     def _by_return(self) -> list[int]:
         modes = list(self.model.modes)
@@ -113,7 +116,11 @@ class Replanner:
         begins = np.zeros(n, dtype=bool) if episode_start is None else np.asarray(episode_start, dtype=bool).reshape(n)
         rank[begins], still[begins], failed[begins], anchor[begins] = 0, 0, False, positions[begins]
 
-        moved = np.linalg.norm(positions - anchor, axis=1) > self.tolerance
+        distances = np.linalg.norm(positions - anchor, axis=1)
+        if self._follows:  # the first distance from an anchor is that of one step
+            steps = distances[(still == 0) & ~begins]
+            self.tolerance = max([self.tolerance or 0.0, *(2 * steps)])
+        moved = distances > (self.tolerance or 0.0)
         anchor[moved] = positions[moved]
         still = np.where(moved | begins, 0, still + 1)
         stuck = still >= self.patience

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_ddiffpg.envs import is_ours, make_vec_env, registered_id
@@ -73,7 +74,8 @@ class Task:
         if model.is_normalized and self.statistics is None:
             raise ValueError("--vec-normalize: not given, but the model was trained on normalised observations")
         try:
-            env = self.make(1, 0)
+            # As SB3 shows images to a model
+            env = BaseAlgorithm._wrap_env(self.make(1, 0), 0)
         except (gym.error.Error, TypeError, ValueError) as error:
             raise ValueError(f"env: {self.id} cannot be made with {self.kwargs}: {error}") from error
         ours, theirs = (model.observation_space, model.action_space), (env.observation_space, env.action_space)

@@ -293,9 +293,9 @@ def _wrapped(wrapper):
     return wrapper(AnyGoal())
 
 
-@pytest.mark.parametrize(("fixed", "said"), [(False, "as if the goal had been where it went"), (True, "their own goal only")])
-def test_a_check_says_so(fixed, said):
-    assert said in str(check_env(AnyGoal(fixed), steps=200))
+@pytest.mark.parametrize("fixed", [False, True])
+def test_a_check_says_so(fixed):
+    assert ("as if the goal had been where it went" not in str(check_env(AnyGoal(fixed), steps=200))) == fixed
 
 
 @pytest.mark.slow

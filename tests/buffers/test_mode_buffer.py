@@ -740,8 +740,10 @@ def test_success_is_what_the_environment_says():
     assert success({"is_success": 0.0}) is False
     # Once an environment gives the flag, an episode without it has failed, whatever its return
     assert success({}) is False and not any(rule.among_best(episode_return) for episode_return in range(100))
-    with pytest.raises(ValueError, match="success_key='solved' is not in an episode's last info; its keys: .*'is_success'"):
+    with pytest.warns(UserWarning, match="success_key='solved' is not in an episode's last info; its keys: .*'is_success'"):
         SuccessRule("solved").check_key({"is_success": True})
+    with pytest.raises(ValueError, match="did you mean 'is_success'"):
+        SuccessRule("issuccess").check_key({"is_success": True})
 
 
 def test_success_without_a_flag_is_a_return_in_the_top_fifth_of_the_latest():

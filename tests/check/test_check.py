@@ -197,7 +197,7 @@ def test_a_goal_environment():
     found = check(GoalEnv())
     assert found.policy == "MultiInputPolicy" and found.features.source == "achieved_goal"
     assert found.features.names == ("achieved_goal[0]", "achieved_goal[1]")
-    assert found.relabels is None  # it has no compute_reward
+    assert found.relabels is False and "so each episode learns from its own" in str(found)  # it has no compute_reward
     assert "mode_features='achieved_goal'" in found.arguments()
     assert 'the key "achieved_goal", the achieved_goal of a goal environment' in str(found)
 

@@ -250,9 +250,20 @@ def test_a_buffer_too_small_for_the_episodes(tmp_path):
 
 
 def test_a_success_key_that_is_missing():
+    """It may be told only where it is True; a misspelling of one that is there is none."""
+    told = r"success_key='solved' is not in an episode's last info; its keys: \[.*'is_success'"
     model = small_model(DummyVecEnv([TwoEnds] * 2), success_key="solved")
-    with pytest.raises(ValueError, match=r"success_key='solved' is not in an episode's last info; its keys: \[.*'is_success'"):
+    with pytest.warns(
+        UserWarning, match=told + r".*\. Episodes count as failures .*; without success_key, 'is_success' would be"
+    ):
         model.learn(100)
+    assert model.replay_buffer.trajectories(True) == []
+    with pytest.raises(ValueError, match=r"success_key='is_succes' .*; did you mean 'is_success'\?"):
+        small_model(DummyVecEnv([TwoEnds] * 2), success_key="is_succes").learn(100)
+    with pytest.warns(
+        UserWarning, match="without success_key, 'success' would be it"
+    ):  # a slip, where it is told only if True
+        small_model(DummyVecEnv([lambda: TwoEnds(None)] * 2), success_key="succes").learn(100)
 
 
 def test_modes_belong_to_their_features(tmp_path):

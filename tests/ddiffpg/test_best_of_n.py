@@ -47,10 +47,8 @@ def one_by_one(model, observation, group, noise):
 
 
 def fixed_noise(model):
-    diffusion = model.policy.actor.diffusion
-    shape = (diffusion.n_steps, 1, N_SAMPLES, diffusion.denoiser.action_in.in_features)
-    noise = th.randn(shape, generator=th.Generator().manual_seed(0))[:, 0]
-    noise[:, 0] = 0.0
+    noise = model.policy.fixed_noise(N_SAMPLES)
+    assert noise.shape[1] == N_SAMPLES and not noise[:, 0].any() and 0.5 < noise[:, 1:].std() < 1.5
     return noise
 
 
@@ -67,7 +65,7 @@ def test_against_one_by_one(model):
         expected = [one_by_one(model, each, int(group), noise)[1] for each, group in zip(observations, groups, strict=True)]
         np.testing.assert_allclose(found, expected, atol=1e-4)
         # Another than without: the critics have a say
-        assert np.abs(found - model.predict(observations, deterministic=True, mode=commanded)[0]).max() > 1e-3
+        assert np.abs(found - model.predict(observations, deterministic=True, mode=commanded, n_samples=1)[0]).max() > 1e-3
 
 
 def test_the_same_call_gives_the_same_action_whatever_is_beside_it(model):
@@ -77,9 +75,19 @@ def test_the_same_call_gives_the_same_action_whatever_is_beside_it(model):
     single = [model.predict(each, deterministic=True, mode=1, n_samples=4)[0] for each in observations]
     np.testing.assert_allclose(single, batch, atol=1e-4)
     assert not np.array_equal(model.predict(observations, mode=1, n_samples=4)[0], batch)
-    # Nothing of it is left
-    plain, _ = model.predict(observations, deterministic=True, mode=1)
-    np.testing.assert_array_equal(model.predict(observations, deterministic=True, mode=1, n_samples=1)[0], plain)
+    # Four are what is drawn where there is to be no chance, and one otherwise
+    np.testing.assert_array_equal(model.predict(observations, deterministic=True, mode=1)[0], batch)
+    drawn = []
+    for n_samples in (None, 1):
+        th.manual_seed(5)
+        drawn.append(model.predict(observations, mode=1, n_samples=n_samples)[0])
+    np.testing.assert_array_equal(*drawn)
+    # One without chance is the actor's, without noise
+    plain, _ = model.predict(observations, deterministic=True, mode=1, n_samples=1)
+    with th.no_grad():
+        embeddings = model.policy.group_embeddings(np.full(len(observations), 2))
+        expected = model.policy.actor(th.as_tensor(observations), deterministic=True, embeddings=embeddings)
+    np.testing.assert_allclose(plain, expected.numpy(), atol=1e-6)
 
 
 def test_modes_that_are_drawn_are_kept(model):

@@ -68,19 +68,27 @@ def sampled(space, n):
     return {"observation": drawn}, drawn
 
 
+def noise_of(path, n, n_samples):
+    """Without chance: no noise for the first action, and what the file says for the others."""
+    known = np.array(about(path)["deterministic_noise"], np.float32)
+    assert known.shape[0] == 4 and not known[0].any() and known[1:].all()
+    return np.tile(known[None, :n_samples], (n, 1, 1, 1))
+
+
 def assert_equal_to_predict(model, path, inputs, observations):
     """For every mode, and for none."""
-    run, actor = session(path), model.policy.actor
-    n = len(next(iter(inputs.values())))
-    silent = np.zeros((n, actor.n_diffusion_steps, actor.diffusion.denoiser.action_in.in_features), np.float32)
+    run, n = session(path), len(next(iter(inputs.values())))
     half = (model.action_space.high - model.action_space.low) / 2
     for mode in [None, *range(len(model.modes))]:
-        index = np.full(n, -1 if mode is None else mode)
-        (found,) = run.run(["action"], {**inputs, "mode": index, "noise": silent})
-        expected, _ = model.predict(observations, deterministic=True, mode=mode)
-        assert found.shape == expected.shape
-        apart = np.abs(found - expected) / half
-        assert apart.max() < CLOSE and np.quantile(apart, 0.99) < 1e-5
+        for n_samples in (1, 4):
+            given = {**inputs, "mode": np.full(n, -1 if mode is None else mode), "noise": noise_of(path, n, n_samples)}
+            (found,) = run.run(["action"], given)
+            expected, _ = model.predict(observations, deterministic=True, mode=mode, n_samples=n_samples)
+            assert found.shape == expected.shape
+            apart = np.abs(found - expected) / half
+            assert np.quantile(apart, 0.99) < 1e-5
+            # Of two actions that are liked alike, a rounding may choose the other
+            assert n_samples > 1 or apart.max() < CLOSE
 
 
 @pytest.fixture(scope="module")
@@ -100,15 +108,15 @@ def test_numbers(exported):
 
 
 def test_noise_is_an_input(exported):
-    """By denoising with the same noise: [T, N, A] there, [N, T, A] in the file."""
+    """By denoising with the same noise: [T, N, A] there, [N, 1, T, A] in the file."""
     model, path = exported
     inputs, observations = sampled(model.observation_space, 50)
-    noise, modes = np.random.standard_normal((50, 5, 1)).astype(np.float32), np.arange(50) % 3 - 1
+    noise, modes = np.random.standard_normal((50, 1, 5, 1)).astype(np.float32), np.arange(50) % 3 - 1
     (found,) = session(path).run(["action"], {**inputs, "mode": modes, "noise": noise})
     embeddings = model.policy.group_embeddings(np.where(modes < 0, -1, modes + 1))
     with th.no_grad():
         condition = model.policy.actor.condition(th.as_tensor(observations), embeddings)
-        expected = model.policy.actor.diffusion.denoise(condition, noise=th.as_tensor(noise).transpose(0, 1))
+        expected = model.policy.actor.diffusion.denoise(condition, noise=th.as_tensor(noise[:, 0]).transpose(0, 1))
     np.testing.assert_allclose(found, expected.numpy(), rtol=0, atol=CLOSE)
     assert len(np.unique(found)) > 30
 
@@ -136,8 +144,10 @@ def test_one_mode_alone(exported, tmp_path):
     assert (np.random.get_state()[1] == random[0]).all() and th.equal(th.random.get_rng_state(), random[1])
     assert [each.name for each in session(alone).get_inputs()] == ["observation", "noise"]
     inputs, observations = sampled(model.observation_space, 20)
-    (found,) = session(alone).run(["action"], {**inputs, "noise": np.zeros((20, 5, 1), np.float32)})
-    np.testing.assert_allclose(found, model.predict(observations, deterministic=True, mode=0)[0], rtol=0, atol=CLOSE)
+    for n_samples in (1, 4):
+        (found,) = session(alone).run(["action"], {**inputs, "noise": noise_of(alone, 20, n_samples)})
+        expected, _ = model.predict(observations, deterministic=True, mode=0, n_samples=n_samples)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=CLOSE)
     assert [each["name"] for each in about(alone)["modes"]] == ["to the left"]
     with pytest.raises(ValueError, match="mode='to the right' is unknown"):
         model.export_onnx(tmp_path / "none.onnx", mode="to the right")

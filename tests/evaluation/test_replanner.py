@@ -21,7 +21,7 @@ from sb3_ddiffpg.modes.mode import Outcome
 class Stub:
     """Three modes; an action is the index of the mode that was commanded."""
 
-    observation_space = spaces.Box(-10.0, 10.0, (3,))
+    observation_space = spaces.Box(-1e5, 1e5, (3,))
     gamma, success_key, resolved_features, is_normalized = 0.9, None, [0, 1], False
 
     def __init__(self, returns=(0.5, 1.0, 0.8), lengths=(5.0, 5.0, 5.0)):
@@ -172,8 +172,17 @@ def test_bad_arguments(arguments, message):
 def test_models_without_modes():
     with pytest.raises(ValueError, match="model: a TD3 without modes given"):
         Replanner(TD3("MlpPolicy", "Pendulum-v1", buffer_size=10))
+
+
+def test_modes_without_a_route_yet():
+    """As of goals in hindsight: what counts as movement follows from the steps that are seen, in whatever unit."""
     model = Stub()
     for mode in model.modes:
         mode.representative = np.zeros((0, 0))
-    with pytest.raises(ValueError, match="tolerance: None given, but the modes have no route"):
-        Replanner(model)
+    for unit in (1.0, 1e-3, 1e3):
+        replanner = Replanner(model, patience=4, order="return")
+        there = unit * np.minimum(0.5 * np.arange(40), 10.0)  # it walks for 20 steps, and stands
+        trembles = 0.1 * unit * np.random.default_rng(0).uniform(-1, 1, 40)
+        path = np.stack((there, trembles), axis=1)[:, None]
+        driven = follow(replanner, path)[:, 0].tolist()
+        assert driven[:21] == [1] * 21 and driven[21:28].count(2) >= 2 and set(driven[28:]) == {0, 1, 2}
