@@ -545,13 +545,14 @@ class DDiffPG(ActorCriticAlgorithm):
 
     def export_onnx(self, path: str | os.PathLike, mode: str | int | Mode | None = None) -> None:
         """
-        Save the policy as one ONNX file, which acts without torch and this package, see ``docs/deployment.md``. Its inputs are
-        ``observation`` (of a dict one for each key, ``observation.KEY``) as the environment gives it, [N, ...]; ``mode``, the
-        index of each row's mode or -1 for none, int64, [N]; and ``noise``, float32, [N, K, T, action_dim], of which K actions
-        are made: that which the mode's critics like best is the output, ``action``, [N, ...], in the environment's units. Noise
-        is standard normal, or what the file says, to act as ``predict(deterministic=True)``. What ``VecNormalize`` does to
-        observations is inside, if the model has its environments. Images are as the model sees them, channels first. The file
-        is tried with onnxruntime before it is written.
+        Save the policy as one ONNX file, which acts without torch and this package, see ``docs/deployment.md``.
+
+        Its inputs are ``observation`` (of a dict one for each key, ``observation.KEY``) as the environment gives it, [N, ...];
+        ``mode``, the index of each row's mode or -1 for none, int64, [N]; and ``noise``, float32, [N, K, T, action_dim], of
+        which K actions are made: that which the mode's critics like best is the output, ``action``, [N, ...], in the
+        environment's units. Noise is standard normal, or what the file says, to act as ``predict(deterministic=True)``. What
+        ``VecNormalize`` does to observations is inside, if the model has its environments. Images are as the model sees them,
+        channels first. The file is tried with onnxruntime before it is written.
 
         :param path: Path to the file
         :param mode: Name or index of the only mode, which is then no input; None: all

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import pathlib
+import zipfile
 from collections import defaultdict
 from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, TypeVar
@@ -198,10 +199,17 @@ class SavableAlgorithm(OffPolicyAlgorithm):
         :return: The model
         :raises ValueError: If ``safe`` and the file is something else or damaged, or does not fit
         """
+        _check_kind(path, safe)
         if safe:
             tree = read(pathlib.Path(path), KIND)  # type: ignore[arg-type]
             return build_model(cls, tree, env, device, custom_objects, **kwargs)
-        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        try:
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except (ValueError, TypeError, AttributeError, LookupError) as error:
+            error.add_note(
+                f"Raised while {path} was loaded as a {cls.__name__}: what another algorithm saved, its class loads"
+            )
+            raise
 
     def export(self, path: str | pathlib.Path, optimizers: bool = False) -> None:
         """
@@ -256,6 +264,20 @@ class SavableAlgorithm(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *declared(type(self), "_unsaved")]
+
+
+def _check_kind(path: Any, safe: bool) -> None:
+    """A file is either what ``save`` wrote or what ``export`` did."""
+    if not isinstance(path, str | pathlib.Path) or not pathlib.Path(path).is_file():
+        return
+    if safe and zipfile.is_zipfile(path):
+        raise ValueError(
+            f"path: {path} was written by save, and may hold code: load it without safe=True if you trust its maker"
+        )
+    with open(path, "rb") as file:
+        is_exported = file.read(9)[8:] == b"{"  # safetensors: the length of a header, and JSON
+    if is_exported and not safe:
+        raise ValueError(f"path: {path} was written by export: load it with safe=True")
 
 
 def read_parameters(model: SavableAlgorithm, given: str | TensorDict, device: th.device | str) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from environments import (
     state_of,
 )
 from gymnasium import spaces
+from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -126,6 +127,20 @@ def test_zip_holds_everything_that_was_learned(novelty, tmp_path):
     assert loaded.mode_manager.next_number == model.mode_manager.next_number
     assert loaded.scheduler.n_turns == model.scheduler.n_turns > 0
     np.testing.assert_array_equal(loaded.scheduler.groups, model.scheduler.groups)
+
+
+def test_a_file_of_the_other_kind(trained, tmp_path):
+    """It is said which it is; a file of another algorithm, what loads it."""
+    trained.save(tmp_path / "model.zip")
+    trained.export(tmp_path / "model.safetensors")
+    with pytest.raises(ValueError, match=r"path: .*model\.safetensors was written by export: load it with safe=True"):
+        DDiffPG.load(tmp_path / "model.safetensors")
+    with pytest.raises(ValueError, match=r"path: .*model\.zip was written by save, .* load it without safe=True"):
+        DDiffPG.load(tmp_path / "model.zip", safe=True)
+    SAC("MlpPolicy", TwoEnds(), buffer_size=10).save(tmp_path / "sac.zip")
+    with pytest.raises(ValueError) as raised:
+        DDiffPG.load(tmp_path / "sac.zip")
+    assert "sac.zip was loaded as a DDiffPG: what another algorithm saved, its class loads" in raised.value.__notes__[0]
 
 
 def test_zip_is_small(trained, tmp_path):
