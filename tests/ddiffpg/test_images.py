@@ -1,5 +1,6 @@
 """Images through a convolution: ``"CnnPolicy"`` as in SB3."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -13,7 +14,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecTran
 
 from sb3_ddiffpg import DDiffPG
 from sb3_ddiffpg.baselines import BASELINES
+from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.evaluation import Replanner
+from sb3_ddiffpg.evaluation.task import Task
 
 IMAGES = {"net_arch": [16], "features_extractor_kwargs": {"features_dim": 8}}
 
@@ -107,3 +110,16 @@ def test_a_replanner_sees_images_of_either_order():
     for given in (image, image.transpose(2, 0, 1)):
         np.testing.assert_array_equal(agent.predict(given, deterministic=True)[0], expected)
     np.testing.assert_array_equal(agent.predict(image[None], deterministic=True)[0], expected[None])
+
+
+def test_images_of_an_environment_are_those_of_the_model():
+    """SB3 shows them with channels first, whatever the environment does: a report is of the same task."""
+    gym.register("Seen-v0", image_env, max_episode_steps=10)
+    try:
+        model = seeing(DDiffPG, make_vec_env("Seen-v0", 2), train_freq=8)
+        Task.of(model).check(model)
+        Task.of(model, "Seen-v0").check(model)
+        with pytest.raises(ValueError, match="has observations and actions"):
+            Task.of(model, "Pendulum-v1").check(model)
+    finally:
+        del gym.registry["Seen-v0"]
