@@ -127,7 +127,7 @@ class EnvCheck:
         parts = {
             "spaces": self._of_spaces(),
             "time limit": self._of_limit(),
-            "success": self._of_success(),
+            "success": [*self._of_success(), *self._of_goals()],
             "mode features": self._of_features(),
             "cells": self._of_cells(),
             "values": self._of_values(),
@@ -210,11 +210,14 @@ class EnvCheck:
             lines.append("random actions have not reached it, which is usual: exploration goes on from here")
         if signal.stands_in and signal.n_counted:
             lines.append(f"until one does, the best fifth of the returns stands in for it ({counted})")
-        if self.relabels is not None:
-            also = "modes also learn from each episode as if the goal had been where it went"
-            only = "no compute_reward for arrays of goals gives the rewards that were met, so each episode learns from its own"
-            lines.append(f"goals differ between episodes: {also if self.relabels else only}")
         return lines
+
+    def _of_goals(self) -> list[str]:
+        if self.relabels is None:
+            return []
+        also = "modes also learn from each episode as if the goal had been where it went"
+        only = "no compute_reward for arrays of goals gives the rewards that were met, so each episode learns from its own"
+        return [f"goals differ between episodes: {also if self.relabels else only}"]
 
     def _of_features(self) -> list[str]:
         features = self.features

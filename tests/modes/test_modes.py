@@ -31,15 +31,15 @@ def test_a_commanded_mode_is_its_embedding(trained):
             expected = trained.actor(tensor, deterministic=True, embeddings=embedding).cpu().numpy()
         expected = trained.policy.unscale_action(expected)
         for command in (mode.name, index, mode, np.int64(index), [mode.name] * 10, [mode] * 10, np.full(10, index)):
-            given, _ = trained.predict(observations, deterministic=True, mode=command)
+            given, _ = trained.predict(observations, deterministic=True, mode=command, n_samples=1)
             np.testing.assert_array_equal(given, expected)
         actions.append(expected)
     with th.no_grad():
         zero = trained.policy.unscale_action(trained.actor(tensor, deterministic=True).cpu().numpy())
-    unconditioned, state = trained.predict(observations, deterministic=True)
+    unconditioned, state = trained.predict(observations, deterministic=True, n_samples=1)
     np.testing.assert_array_equal(unconditioned, zero)
     assert state is None
-    mixed, _ = trained.predict(observations[:2], deterministic=True, mode=[trained.modes[1].name, 0])
+    mixed, _ = trained.predict(observations[:2], deterministic=True, mode=[trained.modes[1].name, 0], n_samples=1)
     np.testing.assert_allclose(mixed, [actions[1][0], actions[0][1]], atol=1e-4)
     assert not np.allclose(actions[0], actions[1]) and not np.allclose(actions[0], zero)
 

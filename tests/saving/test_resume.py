@@ -242,7 +242,7 @@ def test_the_settings_of_the_model_stay(trained, tmp_path):
     model.load_replay_buffer(tmp_path / "buffer")
     model.recluster()
     assert [mode.n_trajectories for mode in model.modes] == [4, 4]
-    with pytest.raises(ValueError, match="success_key='nowhere'"):
+    with pytest.warns(UserWarning, match="success_key='nowhere'"):
         model.learn(100, reset_num_timesteps=False)
 
 
