@@ -57,7 +57,11 @@ def same(ours, theirs):
     return ours.dtype == theirs.dtype and np.array_equal(ours, theirs)
 
 
-@pytest.mark.parametrize("make", [TwoEnds, lambda: AnySpaces(image_dict_space())])
+# Of those that are slow each makes several processes, which import torch
+IMAGES = pytest.param(lambda: AnySpaces(image_dict_space()), marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("make", [TwoEnds, IMAGES])
 def test_like_one_process_bit_for_bit(make):
     actors, single = RayVecEnv([make] * 5, n_workers=2), DummyVecEnv([make] * 5)
     assert (actors.num_envs, len(actors.actors), actors.first.tolist()) == (5, 2, [0, 2, 5])
@@ -119,6 +123,7 @@ def test_a_group_that_is_killed_is_replaced(fragile):
     assert len({*fragile.env_method("pid")}) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asked", ["get_attr", "reset"])
 def test_one_that_is_lost_between_two_steps(fragile, asked):
     """Whoever asks first is answered by the new one; unless all begin anew, the next step says that episodes have ended."""
@@ -138,6 +143,7 @@ def test_one_that_is_lost_between_two_steps(fragile, asked):
         assert not fragile.step(actions)[2].any()
 
 
+@pytest.mark.slow
 def test_training_goes_on(fragile):
     """What was lost ends as if the time was up: no goal, and nothing after it belongs to it."""
     model = small_model(fragile, action_noise=None)
