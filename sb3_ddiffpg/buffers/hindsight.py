@@ -80,13 +80,12 @@ class Hindsight:
         """
         :param buffer: A ``ModeReplayBuffer``, in which trajectories have ended
         """
-        rows = buffer.stored_rows.spread(_LOOKED_AT)
-        if not len(rows):
+        if (seen := _looked_at(buffer)) is None:
             return
-        if not goals_differ(buffer):
+        rows, achieved, desired = seen
+        if not _differ(achieved, desired):
             self.in_use = False
             return
-        achieved, desired = (_part(buffer.nexts, name, rows) for name in (_ACHIEVED_NEXT, _DESIRED_NEXT))
         alike = np.isclose(self.rewards(achieved, desired), buffer.rewards[rows], rtol=1e-3, atol=1e-5)
         self.in_use = bool(1 - alike.mean() <= _MOST_OTHERS)
         if not self.in_use and not self._warned:
@@ -148,10 +147,22 @@ def goals_differ(buffer: Any) -> bool:
     :param buffer: A ``ModeReplayBuffer``
     :return: Whether episodes that are stored have other goals, beyond a sensor's noise
     """
-    space, rows = buffer.observation_space, buffer.stored_rows.spread(_LOOKED_AT)
-    if not (isinstance(space, spaces.Dict) and {ACHIEVED, DESIRED} <= set(space.spaces) and len(rows)):
+    space = buffer.observation_space
+    if not (isinstance(space, spaces.Dict) and {ACHIEVED, DESIRED} <= set(space.spaces)):
         return False
-    achieved, desired = (_part(buffer.nexts, name, rows) for name in (_ACHIEVED_NEXT, _DESIRED_NEXT))
+    seen = _looked_at(buffer)
+    return seen is not None and _differ(*seen[1:])
+
+
+def _looked_at(buffer: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Some rows from all over, and their goals, achieved and desired; None where none is stored."""
+    rows = buffer.stored_rows.spread(_LOOKED_AT)
+    if not len(rows):
+        return None
+    return rows, _part(buffer.nexts, _ACHIEVED_NEXT, rows), _part(buffer.nexts, _DESIRED_NEXT, rows)
+
+
+def _differ(achieved: np.ndarray, desired: np.ndarray) -> bool:
     return bool(np.ptp(desired, axis=0).max() > _SAME * np.ptp(achieved, axis=0).max())
 
 

@@ -191,7 +191,7 @@ def export_onnx(model: Any, path: str | os.PathLike, mode: int | None = None) ->
             unfinished.unlink(missing_ok=True)
 
 
-def _example(graph: PolicyGraph, n_samples: int = 2) -> dict[str, th.Tensor]:
+def _example(graph: PolicyGraph) -> dict[str, th.Tensor]:
     """Inputs of the file, by name, in their order."""
     space, diffusion = graph.actor.observation_space, graph.actor.diffusion
     parts = space.spaces if isinstance(space, spaces.Dict) else {None: space}
@@ -201,7 +201,7 @@ def _example(graph: PolicyGraph, n_samples: int = 2) -> dict[str, th.Tensor]:
         inputs[OBSERVATION if key is None else f"{OBSERVATION}.{key}"] = th.as_tensor(drawn)
     if graph.mode is None:
         inputs[MODE] = th.arange(N_TRIED) % (graph.n_modes + 1) - 1
-    inputs[NOISE] = th.randn(N_TRIED, n_samples, diffusion.n_steps, diffusion.denoiser.action_in.in_features)
+    inputs[NOISE] = th.randn(N_TRIED, 2, diffusion.n_steps, diffusion.denoiser.action_in.in_features)
     return inputs
 
 
@@ -215,20 +215,16 @@ def _exported(graph: PolicyGraph, inputs: dict[str, th.Tensor]) -> Any:
     shapes[-1] = {0: rows, 1: samples}
     with warnings.catch_warnings(), _quiet("torch.onnx"):
         warnings.simplefilter("ignore")  # of what it has installed, and of names of axes
-        return _export(graph, inputs, shapes)
-
-
-def _export(graph: PolicyGraph, inputs: dict[str, th.Tensor], shapes: list[dict[int, Any]]) -> Any:
-    return th.onnx.export(
-        _Flat(graph, _keys(inputs)).eval(),
-        tuple(each.to(graph.low.device) for each in inputs.values()),
-        input_names=list(inputs),
-        output_names=[ACTION],
-        dynamic_shapes=(tuple(shapes),),
-        dynamo=True,
-        verbose=False,
-        external_data=False,
-    )
+        return th.onnx.export(
+            _Flat(graph, _keys(inputs)).eval(),
+            tuple(each.to(graph.low.device) for each in inputs.values()),
+            input_names=list(inputs),
+            output_names=[ACTION],
+            dynamic_shapes=(tuple(shapes),),
+            dynamo=True,
+            verbose=False,
+            external_data=False,
+        )
 
 
 @contextmanager

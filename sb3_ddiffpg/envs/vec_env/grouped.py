@@ -61,6 +61,27 @@ def answer_of(envs: Any, command: str, argument: Any) -> Any:
     return answers
 
 
+def check_groups(n_workers: int | None, timeout: float | None) -> None:
+    """
+    :param n_workers: number of groups, None if nobody said it
+    :param timeout: seconds to wait for an answer; None: for ever
+    :raises ValueError: if there are none, or no time
+    """
+    if n_workers is not None and n_workers < 1:
+        raise ValueError(f"n_workers: {n_workers} given; accepted are whole numbers from 1 up")
+    if timeout is not None and not timeout > 0:
+        raise ValueError(f"timeout: {timeout} given; accepted are numbers above 0, and None")
+
+
+def first_of_groups(n_envs: int, n_groups: int) -> np.ndarray:
+    """
+    :param n_envs: number of environments
+    :param n_groups: number of groups, of sizes as equal as can be
+    :return: first environment of each group, and the number of environments
+    """
+    return np.linspace(0, n_envs, n_groups + 1).round().astype(int)
+
+
 class GroupedVecEnv(VecEnv):
     """
     Environments in groups, each of which is one ``DummyVecEnv`` somewhere else. A subclass says how they are asked.

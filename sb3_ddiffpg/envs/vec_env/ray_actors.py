@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_ddiffpg.envs.vec_env.grouped import NOBODY, GroupedVecEnv, answer_of, make_group
+from sb3_ddiffpg.envs.vec_env.grouped import NOBODY, GroupedVecEnv, answer_of, check_groups, first_of_groups, make_group
 
 # Losses of one group in a row, without an answer between them, after which there is no further one
 MOST_LOSSES = 3
@@ -68,17 +68,14 @@ class RayVecEnv(GroupedVecEnv):
             import ray
         except ImportError as error:
             raise ImportError(f"Ray is an extra ({error}); install it with: pip install 'sb3_ddiffpg[cluster]'") from error
-        if n_workers is not None and n_workers < 1:
-            raise ValueError(f"n_workers: {n_workers} given; accepted are whole numbers from 1 up")
-        if timeout is not None and not timeout > 0:
-            raise ValueError(f"timeout: {timeout} given; accepted are numbers above 0, and None")
+        check_groups(n_workers, timeout)
         self._ray, self.timeout = ray, timeout
         if not ray.is_initialized():
             ray.init(address, log_to_driver=False, configure_logging=False, include_dashboard=False)
         if n_workers is None:
             n_workers = max(1, math.floor(ray.cluster_resources().get("CPU", 1)))
         n_workers = min(n_workers, len(env_fns))
-        self.first = np.linspace(0, len(env_fns), n_workers + 1).round().astype(int)
+        self.first = first_of_groups(len(env_fns), n_workers)
         self._env_fns = [list(env_fns[first:last]) for first, last in self._ranges()]
         self._actor: Any = ray.remote(**{"scheduling_strategy": "SPREAD", **(options or {})})(_Group)
         self._closed = False
@@ -116,10 +113,12 @@ class RayVecEnv(GroupedVecEnv):
         return results
 
     def _hear_one(self, group: int, command: str, argument: Any, reference: Any) -> tuple[str, Any]:
-        for _ in range(MOST_LOSSES):
-            if reference is None:
-                return "ok", self._lost_step(group)
+        for n_losses in range(MOST_LOSSES):
             try:
+                if n_losses:
+                    reference = self._replace(group, command, argument)
+                if reference is None:
+                    return "ok", self._lost_step(group)
                 answer: tuple[str, Any] = self._ray.get(reference, timeout=self.timeout)
                 if command == "reset":
                     self._begun.pop(group, None)
@@ -128,13 +127,12 @@ class RayVecEnv(GroupedVecEnv):
                 return "error", (NOBODY, False, str(error))
             except self._ray.exceptions.RayError as error:
                 cause: Exception = error
-            reference = self._replace(group, command, argument, cause)
+                warnings.warn(f"{self._who(group)} are lost ({_short(cause)}). They begin new episodes elsewhere")
         self.close()
         raise RuntimeError(f"{self._who(group)} were lost {MOST_LOSSES} times in a row; the last time: {_short(cause)}")
 
-    def _replace(self, group: int, command: str, argument: Any, cause: Exception) -> Any:
+    def _replace(self, group: int, command: str, argument: Any) -> Any:
         """A new actor, and the answer to the command that it is to give; None to a step, for it is where a reset leads."""
-        warnings.warn(f"{self._who(group)} are lost ({_short(cause)}). They begin new episodes elsewhere")
         self._ray.kill(self.actors[group])  # it may yet live
         actor = self.actors[group] = self._actor.remote()
         answer = actor.answer.remote("make", self._env_fns[group])
@@ -143,10 +141,7 @@ class RayVecEnv(GroupedVecEnv):
         if command != "reset":
             n_envs = len(self._env_fns[group])
             begun = actor.answer.remote("reset", ([None] * n_envs, [{}] * n_envs))
-            try:
-                status, result = self._ray.get(begun, timeout=self.timeout)
-            except self._ray.exceptions.RayError:
-                return begun  # lost again, which is counted
+            status, result = self._ray.get(begun, timeout=self.timeout)
             if status == "error":
                 return begun
             self._begun[group] = result

@@ -11,10 +11,9 @@ from multiprocessing.util import Finalize
 from typing import Any, NoReturn
 
 import gymnasium as gym
-import numpy as np
 from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv
 
-from sb3_ddiffpg.envs.vec_env.grouped import NOBODY, GroupedVecEnv, answer_of, make_group
+from sb3_ddiffpg.envs.vec_env.grouped import NOBODY, GroupedVecEnv, answer_of, check_groups, first_of_groups, make_group
 from sb3_ddiffpg.utils.processors import n_processors
 from sb3_ddiffpg.utils.signals import uninterrupted
 
@@ -88,13 +87,10 @@ class WorkerVecEnv(GroupedVecEnv):
     ) -> None:
         if n_workers is None:
             n_workers = n_processors()
-        if n_workers < 1:
-            raise ValueError(f"n_workers: {n_workers} given; accepted are whole numbers from 1 up")
-        if timeout is not None and not timeout > 0:
-            raise ValueError(f"timeout: {timeout} given; accepted are numbers above 0, and None")
+        check_groups(n_workers, timeout)
         self.timeout = math.inf if timeout is None else timeout
         n_workers = min(n_workers, len(env_fns))
-        self.first = np.linspace(0, len(env_fns), n_workers + 1).round().astype(int)
+        self.first = first_of_groups(len(env_fns), n_workers)
         # Not fork: simulators and networks have threads by then. No server that forks: a signal to all would end it, and them
         context: Any = multiprocessing.get_context("spawn")
         self.remotes: list[Connection] = []
