@@ -96,11 +96,11 @@ class PlainUpdate:
         :param group: Whose critics
         :param features: Shape [n, F]
         :param actions: Shape [n, action_dim]
-        :return: Gradient of the smaller of the twins' values, shape [n, action_dim]
+        :return: Gradient of the first critic's value, shape [n, action_dim]
         """
         actions = actions.detach().requires_grad_()
-        values = [self._value(critic(features, actions), group) for critic in self.critics[group]]  # type: ignore[union-attr]
-        th.minimum(*values).sum().backward()  # the weights' gradients come with it
+        critic: Any = self.critics[group][0]  # type: ignore[index]
+        self._value(critic(features, actions), group).sum().backward()  # the weights' gradients come with it
         assert actions.grad is not None
         return actions.grad
 

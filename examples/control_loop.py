@@ -29,6 +29,9 @@ class Policy:
         self.chooses = "mode" in {each.name for each in self.session.get_inputs()}
         # Always the same noise: the same observation, the same action. Of four actions the mode's critics choose one
         self.noise = np.array(self.about["deterministic_noise"], np.float32)[None]
+        # Of a policy that says the actions of several steps at once, those that are left
+        self.plan: list[np.ndarray] = []
+        self.followed: str | None = None
 
     def __call__(self, observation: dict[str, np.ndarray], mode: str | None = None) -> np.ndarray:
         """
@@ -36,11 +39,14 @@ class Policy:
         :param mode: Name of the mode to follow; None leaves the choice to the policy
         :return: The action, in the environment's units
         """
-        inputs = {name: value[None] for name, value in observation.items()}
-        if self.chooses:
-            index = -1 if mode is None else self.names.index(mode)
-            inputs["mode"] = np.array([index], np.int64)
-        return self.session.run(["action"], {**inputs, "noise": self.noise})[0][0]
+        if not self.plan or mode != self.followed:
+            inputs = {name: value[None] for name, value in observation.items()}
+            if self.chooses:
+                index = -1 if mode is None else self.names.index(mode)
+                inputs["mode"] = np.array([index], np.int64)
+            action = self.session.run(["action"], {**inputs, "noise": self.noise})[0][0]
+            self.plan, self.followed = list(action) if self.about["action_chunk"] > 1 else [action], mode
+        return self.plan.pop(0)
 
 
 class Robot:

@@ -14,7 +14,7 @@ from torch import nn
 from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, names_of
 from sb3_ddiffpg.buffers.batch import ModeBatch
 from sb3_ddiffpg.common.actor_critic import Metrics
-from sb3_ddiffpg.networks.diffusion import Denoiser
+from sb3_ddiffpg.networks.denoiser import Denoiser
 from sb3_ddiffpg.networks.policies import Actor
 from sb3_ddiffpg.utils.settings import NOT_NEGATIVE, Accepted, at_least, is_integer
 
@@ -80,7 +80,7 @@ class ConsistencyActor(Actor):
         :return: Actions in [-1, 1], [N, action_dim]
         """
         condition_part = self.network.condition_in(self.features(obs))
-        shape = (len(condition_part), self.network.action_in.in_features)
+        shape = (len(condition_part), self.network.action_dim)
 
         def noise() -> th.Tensor:
             draw = th.zeros if deterministic else th.randn

@@ -11,7 +11,7 @@ from sb3_ddiffpg.baselines.baseline import Baseline, BaselinePolicy, FifoReplayB
 from sb3_ddiffpg.buffers.batch import ModeBatch
 from sb3_ddiffpg.common.actor_critic import Metrics
 from sb3_ddiffpg.networks.cuda_graphs import graphed
-from sb3_ddiffpg.networks.diffusion import DiffusionActor
+from sb3_ddiffpg.networks.diffusion_actor import DiffusionActor
 from sb3_ddiffpg.networks.settings import TargetActionSettings
 from sb3_ddiffpg.networks.target_actions import climb
 from sb3_ddiffpg.serialization.codec import registered

@@ -31,12 +31,14 @@ class ModeBatch(NamedTuple):
     """
     One batch, split evenly over G groups: the exploratory one first, then every mode. N = G * n rows, group by group.
 
-    Observations are [N, ...] (or dicts of such), ``actions``, ``target_actions`` [G, n, action_dim], ``rewards`` and
-    ``discounts`` [G, n]. ``active`` [G] is False for a mode without any transition, whose rows are a stand-in that must
-    not train it. ``imitated`` [G, n] is False for these and for steps of off-mode successes, which the policy must not
-    learn. ``new_routes`` [n] are the exploratory group's returns from goals reached by routes of which a mode has not its
-    fill. ``rows`` [G, n] say where in the buffer the transitions lie, ``dormant`` which groups are not
-    active, ``visited`` what novelty is paid for, ``relabelled`` [G, n] which of them were given another goal (None: none).
+    Observations are [N, ...] (or dicts of such), ``actions``, ``target_actions`` [G, n, k * action_dim], those of k steps one
+    after the other, of which ``executed``, of the same shape, says which there were (None: all), ``rewards`` and ``discounts``
+    [G, n]. ``active`` [G] is False for a mode without any transition, whose rows are a stand-in that must not train it.
+    ``imitated`` [G, n] is False for these and for steps of off-mode successes, which the policy must not learn.
+    ``new_routes`` [n] are the exploratory group's returns from goals reached by routes of which a mode has not its fill.
+    ``rows`` [G, n] say where in the buffer the transitions lie, ``chunks`` [G, n, k] where those of all k steps do, -1 where
+    the episode was over (None: k is 1), ``dormant`` which groups are not active, ``visited`` what novelty is paid for,
+    ``relabelled`` [G, n] which of them were given another goal (None: none).
     """
 
     observations: Any
@@ -52,3 +54,5 @@ class ModeBatch(NamedTuple):
     dormant: list[int]
     visited: VisitedSteps
     relabelled: np.ndarray | None = None
+    chunks: np.ndarray | None = None
+    executed: th.Tensor | None = None

@@ -14,13 +14,13 @@ from sb3_ddiffpg.buffers.returns import group_returns
 from sb3_ddiffpg.buffers.state import buffer_state, restore_buffer
 from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
 from sb3_ddiffpg.serialization.codec import registered
-from sb3_ddiffpg.utils.settings import FLAG, SHARE
+from sb3_ddiffpg.utils.settings import FLAG, SHARE, at_least
 
 # What may be changed when a run goes on; n_path_points may not: stored paths have so many
 _MODE_SETTINGS = (
     *("max_successes_per_mode", "max_failures_per_mode", "max_length_ratio", "min_direct"),
     *("compared_length", "loop_share"),
-    *("new_route_share", "explore_beyond_goals"),
+    *("new_route_share", "explore_beyond_goals", "action_chunk"),
 )
 
 
@@ -33,16 +33,28 @@ class ModeReplayBuffer(AssignedReplayBuffer):
     :param new_route_share: Share of the exploratory group's rows that are drawn from trajectories which reached a goal by a
         route of which a mode has not its fill
     :param explore_beyond_goals: Whether a goal does not end the exploratory group's returns
+    :param action_chunk: Steps whose actions are drawn together
     :param kwargs: Of ``AssignedReplayBuffer``
     :raises ValueError: If an argument is out of its range or ``optimize_memory_usage`` is asked for
     """
 
-    def __init__(self, *args: Any, new_route_share: float = 0.0, explore_beyond_goals: bool = False, **kwargs: Any) -> None:
+    action_chunk = 1  # of pickled ones that knew of none
+
+    def __init__(
+        self,
+        *args: Any,
+        new_route_share: float = 0.0,
+        explore_beyond_goals: bool = False,
+        action_chunk: int = 1,
+        **kwargs: Any,
+    ) -> None:
         for gone in ("visit_cell_size", "route_share"):  # of version 0.1: the bonus's, and a constant
             kwargs.pop(gone, None)
         new_route_share = kwargs.pop("new_way_share", new_route_share)
         SHARE.check("new_route_share", new_route_share)
         FLAG.check("explore_beyond_goals", explore_beyond_goals)
+        at_least(1).check("action_chunk", action_chunk)
+        self.action_chunk = action_chunk
         self.new_route_share = new_route_share
         self.explore_beyond_goals = explore_beyond_goals
         super().__init__(*args, **kwargs)
@@ -109,8 +121,8 @@ class ModeReplayBuffer(AssignedReplayBuffer):
 
         :param batch_size: Number of transitions B; each of the G groups gets B // G
         :param gamma: Discount factor
-        :param exploration_n_steps: Length of the exploratory group's returns
-        :param mode_n_steps: Length of the modes' returns
+        :param exploration_n_steps: Length of the exploratory group's returns; no less than ``action_chunk`` in any case
+        :param mode_n_steps: Length of the modes' returns, like it
         :param env: Normalises observations and rewards when given
         :param exploration_gamma: The exploratory group's discount factor; None: gamma
         :param visits_of_modes: Whether ``visited`` is of all groups, or of the exploratory one alone
@@ -127,6 +139,7 @@ class ModeReplayBuffer(AssignedReplayBuffer):
         if len(self.new_route_rows) and self.new_route_share:
             n_new = round(self.new_route_share * n)
             rows[EXPLORATORY_GROUP, :n_new] = np.random.choice(self.new_route_rows, n_new)
+        exploration_n_steps, mode_n_steps = (max(each, self.action_chunk) for each in (exploration_n_steps, mode_n_steps))
         windows = self._windows(rows, exploration_n_steps, mode_n_steps)
         notes = self.notes.take(windows)
         goals_are_told: Any = self.goals_are_told
@@ -151,14 +164,15 @@ class ModeReplayBuffer(AssignedReplayBuffer):
         # What led away from the route is for the critic to judge, not for the policy to follow
         imitated = active[:, None] & ~notes["off_mode_success"][..., 0]
         imitated[EXPLORATORY_GROUP] = True
+        chunks = windows[..., : self.action_chunk]
         steps = self._on_device(self.steps.tensors(rows.ravel()))
         nexts = self._on_device(self.nexts.tensors(returns.last.ravel()))
-        actions = steps["actions"].view(*rows.shape, self.action_dim)
+        actions, executed = self._chunked(steps, "actions", chunks)
         on_route = np.where(returns.lost, -1, windows)
         return ModeBatch(
             observations=self.normalized(with_goals(self._as_observation(steps, "observations"), relabelling), env),
             actions=actions,
-            target_actions=self._target_actions(steps, actions, relabelling),
+            target_actions=self._target_actions(steps, actions, chunks, relabelling),
             next_observations=self.normalized(with_goals(self._as_observation(nexts, "next_observations"), relabelling), env),
             rewards=self._to_device(returns.rewards.astype(np.float32)),
             discounts=self._to_device(returns.discounts.astype(np.float32)),
@@ -166,14 +180,39 @@ class ModeReplayBuffer(AssignedReplayBuffer):
             imitated=self._to_device(imitated),
             new_routes=self._to_device(returns.new_routes.astype(np.float32)),
             rows=rows,
+            chunks=None if self.action_chunk == 1 else chunks,
             relabelled=None if relabelling is None else relabelling.chosen,
+            executed=executed,
             dormant=np.flatnonzero(~active).tolist(),
             visited=self.visited(on_route if visits_of_modes else on_route[:1, :, :exploration_n_steps]),
         )
 
-    def _target_actions(self, steps: dict[str, th.Tensor], actions: th.Tensor, relabelling: Any = None) -> th.Tensor:
-        """Of the exploratory group, and of each mode its own, [G, n, action_dim]; the actions where none are stored."""
-        stored = [steps[name].view(actions.shape) for name in self.target_action_fields]
+    def _chunked(
+        self, steps: dict[str, th.Tensor], name: str, chunks: np.ndarray, instead: th.Tensor | None = None
+    ) -> tuple[th.Tensor, th.Tensor | None]:
+        """
+        A field with an action in it of the steps of chunks, one after the other, [G, n, k * action_dim], and which of them
+        there were, None if all. Where the episode was over before, ``instead``, or by chance: it matters not what else was
+        to be done.
+        """
+        first = steps[name].view(*chunks.shape[:2], self.action_dim)
+        if self.action_chunk == 1:
+            return first, None
+        there = chunks[..., 1:].ravel() >= 0
+        others = self._on_device(self.steps.tensors(np.maximum(chunks[..., 1:].ravel(), 0)))[name]
+        values = th.cat((first[..., None, :], others.view(*chunks.shape[:2], -1, self.action_dim)), dim=2).flatten(2)
+        executed = th.ones_like(values)
+        executed[..., self.action_dim :] = self._to_device(
+            there.reshape(*chunks.shape[:2], -1).repeat(self.action_dim, axis=-1)
+        )
+        instead = 2 * th.rand_like(values) - 1 if instead is None else instead
+        return th.where(executed > 0, values, instead), executed
+
+    def _target_actions(
+        self, steps: dict[str, th.Tensor], actions: th.Tensor, chunks: np.ndarray, relabelling: Any = None
+    ) -> th.Tensor:
+        """Of the exploratory group, and of each mode its own, like the actions; these where none are stored."""
+        stored = [self._chunked(steps, name, chunks, actions)[0] for name in self.target_action_fields]
         if not stored:
             return actions
         targets = th.cat((stored[-1][:1], stored[0][1:]))
@@ -186,16 +225,19 @@ class ModeReplayBuffer(AssignedReplayBuffer):
         Write improved target actions back.
 
         :param batch: As drawn by ``sample_modes``
-        :param target_actions: Shape [G, n, action_dim]
+        :param target_actions: Shape [G, n, k * action_dim]
         """
         if self.storage_device.type == "cpu":
             target_actions = target_actions.cpu()
-        self.steps.write("exploratory_target_actions", batch.rows[0], target_actions[0])
-        groups = [mode + 1 for mode, row_set in enumerate(self.mode_rows) if row_set.size]
-        if groups:
-            improved = th.cat([target_actions[group] for group in groups])
-            rows = batch.rows[groups].ravel()
-            if batch.relabelled is not None:  # those are for other goals
-                own = ~batch.relabelled[groups].ravel()
-                rows, improved = rows[own], improved[th.from_numpy(own).to(improved.device)]
-            self.steps.write("target_actions", rows, improved)
+        improved = target_actions.unflatten(2, (self.action_chunk, self.action_dim))
+        chunks = batch.rows[..., None] if batch.chunks is None else batch.chunks
+        kept = chunks >= 0
+        if batch.relabelled is not None:  # those are for other goals
+            kept[1:] &= ~batch.relabelled[1:, :, None]
+        active = [mode + 1 for mode, row_set in enumerate(self.mode_rows) if row_set.size]
+        for name, groups in (("exploratory_target_actions", [EXPLORATORY_GROUP]), ("target_actions", active)):
+            if groups:
+                chosen = np.flatnonzero(kept[groups])
+                values = th.cat([improved[group] for group in groups]).flatten(0, 1)
+                values = values.index_select(0, th.from_numpy(chosen).to(values.device, non_blocking=True))
+                self.steps.write(name, chunks[groups].ravel()[chosen], values)

@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -322,7 +323,9 @@ class ActorCriticAlgorithm(CollectingAlgorithm):
         self.divergence_watch.report()
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        means = {name: th.stack(values).mean().item() for name, values in metrics.items()}
+        # All of them at once: an accelerator is waited for, and a processor called, but once
+        numbers = iter(th.stack([each for values in metrics.values() for each in values]).tolist() if metrics else ())
+        means = {name: sum(islice(numbers, len(values))) / len(values) for name, values in metrics.items()}
         for name, mean in means.items():
             self.logger.record(f"train/{name}", mean)
         cut, values = means.get(CUT_VALUES, 0.0), self.value_range

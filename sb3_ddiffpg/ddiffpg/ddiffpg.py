@@ -31,7 +31,7 @@ from sb3_ddiffpg.modes.mode import Mode, ModeTable
 from sb3_ddiffpg.modes.settings import ModeSettings
 from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
 from sb3_ddiffpg.networks.cuda_graphs import graphed
-from sb3_ddiffpg.networks.diffusion import DiffusionActor
+from sb3_ddiffpg.networks.diffusion_actor import DiffusionActor
 from sb3_ddiffpg.networks.settings import CriticSettings, TargetActionSettings
 from sb3_ddiffpg.networks.target_actions import climb
 from sb3_ddiffpg.networks.value_range import ValueRange
@@ -41,6 +41,8 @@ from sb3_ddiffpg.serialization.safetensors_tree import Count
 from sb3_ddiffpg.utils.settings import Accepted, Settings, at_least
 from sb3_ddiffpg.utils.signals import uninterrupted
 
+# Updates of the critics for each of policy and target actions, where the policy is a flow: as in TD3
+FLOW_DELAY = 2
 # Of the exploratory group's batch, from trajectories that took a new route: among all transitions these are too few to be met
 NEW_ROUTE_SHARE = 0.25
 
@@ -72,7 +74,8 @@ class DDiffPG(ActorCriticAlgorithm):
     :param n_steps: Length of the multi-step returns (uncorrected), where ``modes`` and ``exploration`` do not say theirs;
         None: 5 for the modes' critics, 1 for the exploratory ones
     :param qf_learning_rate: Learning rate of the critics, like ``learning_rate``; the same as it when None
-    :param n_diffusion_steps: Number of diffusion steps T
+    :param n_diffusion_steps: Steps T of the paper's diffusion policy, which has 5 and learns at every update of the critics.
+        None: a flow of two steps along straight lines, which learns at every second, as TD3 does: as many routes in less time
     :param recluster_freq: Rollouts between two re-clusterings
     :param reward_scale: Factor on the environment's reward
     :param max_grad_norm: Largest gradient norm of the policy, of each mode's critics and of their features extractor
@@ -107,8 +110,8 @@ class DDiffPG(ActorCriticAlgorithm):
         *(CriticSettings, NoveltySettings, ExplorationSettings, ModeSettings, TargetActionSettings),
     )
     accepted: ClassVar[dict[str, Accepted]] = {
-        **dict.fromkeys(("n_diffusion_steps", "recluster_freq"), at_least(1)),
-        "n_steps": at_least(1).or_none(),
+        "recluster_freq": at_least(1),
+        **dict.fromkeys(("n_diffusion_steps", "n_steps"), at_least(1).or_none()),
     }
     manager_class: ClassVar[type[ModeManager]] = ModeManager
     policy: DiffusionPolicy
@@ -144,7 +147,7 @@ class DDiffPG(ActorCriticAlgorithm):
         optimize_memory_usage: bool = False,
         n_steps: int | None = None,
         qf_learning_rate: float | Schedule | None = None,
-        n_diffusion_steps: int = 5,
+        n_diffusion_steps: int | None = None,
         recluster_freq: int = 25,
         reward_scale: float = 1.0,
         max_grad_norm: float = 1.0,
@@ -248,6 +251,7 @@ class DDiffPG(ActorCriticAlgorithm):
         return {
             **arguments,
             "standardize": standardize,
+            "action_chunk": self.policy_kwargs.get("action_chunk", 1),
             "max_successes_per_mode": self.mode_settings.max_successes,
             "max_failures_per_mode": self.mode_settings.max_failures,
             "explore_beyond_goals": self.exploration_settings.beyond_goals,
@@ -286,7 +290,7 @@ class DDiffPG(ActorCriticAlgorithm):
         """
         names = ["exploratory critics", *(f"critics of {mode.name!r}" for mode in self.mode_manager.modes)]
         with self._updates(gradient_steps) as metrics:
-            for _ in range(gradient_steps):
+            for n_before in range(self._n_updates, self._n_updates + gradient_steps):
                 # Sample one batch per mode, and one for the exploratory group
                 batch = self.replay_buffer.sample_modes(
                     batch_size,
@@ -303,12 +307,14 @@ class DDiffPG(ActorCriticAlgorithm):
                 rewards = self._rewards(batch, metrics)
                 # Update each critic with the Bellman equation on its own batch
                 self._update_critics(batch, rewards, metrics, names)
+                self._update_targets()
+                if self.n_diffusion_steps is None and n_before % FLOW_DELAY == 0:
+                    continue
                 # Gradient ascent on the target actions, which return to the buffer
                 target_actions = self._improve_target_actions(batch)
                 metrics["target_action_shift"].append((target_actions - batch.target_actions).abs().mean())
                 # Concatenate all batches and update the diffusion policy
                 metrics["actor_loss"].append(self._update_policy(batch, target_actions))
-                self._update_targets()
 
     def _rewards(self, batch: ModeBatch, metrics: Metrics) -> th.Tensor:
         """Intrinsic reward for the exploratory group, the environment's (and some intrinsic) for the modes, [G, n]."""
@@ -337,6 +343,8 @@ class DDiffPG(ActorCriticAlgorithm):
         embeddings = self.policy.row_embeddings(batch.rewards.shape[1], self.mode_settings.mask_prob)
         condition = self.actor.condition(batch.observations, embeddings)
         weights = batch.imitated.flatten().float()
+        if batch.executed is not None:
+            weights = weights[:, None] * batch.executed.flatten(0, 1)
         loss = self.actor.diffusion.loss(target_actions.flatten(0, 1), condition, weights=weights)
         self.actor.optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -486,7 +494,11 @@ class DDiffPG(ActorCriticAlgorithm):
         if length is not None:
             # On average after the time that a mode needs for all of its route
             self.scheduler.hand_over(1 / length)
-        return self.policy.predict(self._last_obs, group=self.scheduler.groups)[0]  # type: ignore[arg-type]
+        groups, plans = self.scheduler.groups, self.scheduler.plans
+        followed = None if plans is None else (groups, *plans)
+        actions, state = self.policy.predict(self._last_obs, followed, group=groups)  # type: ignore[arg-type]
+        self.scheduler.plans = None if state is None else state[1:]
+        return actions
 
     def _exploration_share(self) -> float:
         if self.num_timesteps < self.learning_starts:
@@ -550,7 +562,9 @@ class DDiffPG(ActorCriticAlgorithm):
         Its inputs are ``observation`` (of a dict one for each key, ``observation.KEY``) as the environment gives it, [N, ...];
         ``mode``, the index of each row's mode or -1 for none, int64, [N]; and ``noise``, float32, [N, K, T, action_dim], of
         which K actions are made: that which the mode's critics like best is the output, ``action``, [N, ...], in the
-        environment's units. Noise is standard normal, or what the file says, to act as ``predict(deterministic=True)``. What
+        environment's units; where the policy has an ``action_chunk`` [N, action_chunk, ...], those of the next steps, and
+        ``action_dim`` above is that of all of them. Noise is standard normal, or what the file says, to act as
+        ``predict(deterministic=True)``. What
         ``VecNormalize`` does to observations is inside, if the model has its environments. Images are as the model sees them,
         channels first. The file is tried with onnxruntime before it is written.
 

@@ -89,8 +89,8 @@ class PolicyGraph(nn.Module):
         """
         :param observations: By key, ``"observation"`` alone where they are no dict, each [N, ...]
         :param mode: Index of each row's mode, -1 for none, int64, [N]; None where the mode is no input
-        :param noise: What is denoised, [N, K, T, action_dim]
-        :return: Actions, [N, *action_space.shape]
+        :param noise: What is denoised, [N, K, n_draws, action_chunk * action_dim]
+        :return: Actions, [N, *action_space.shape], or those of the next steps, [N, action_chunk, *action_space.shape]
         """
         n, n_samples = noise.shape[:2]
         seen = {
@@ -110,7 +110,8 @@ class PolicyGraph(nn.Module):
         own = values.gather(0, (mode + 1).clamp(min=0)[None, :, None].expand(1, n, n_samples))[0]
         best = th.where((mode < 0)[:, None], anybody, own).argmax(dim=1)
         chosen = actions.unflatten(0, (n, n_samples)).gather(1, best[:, None, None].expand(n, 1, actions.shape[1]))[:, 0]
-        return self.low + 0.5 * (chosen.unflatten(1, self.low.shape) + 1.0) * self.range
+        shape = self.low.shape if self.actor.action_chunk == 1 else (self.actor.action_chunk, *self.low.shape)
+        return self.low + 0.5 * (chosen.unflatten(1, shape) + 1.0) * self.range
 
 
 class _SiLU(nn.Module):
@@ -201,7 +202,7 @@ def _example(graph: PolicyGraph) -> dict[str, th.Tensor]:
         inputs[OBSERVATION if key is None else f"{OBSERVATION}.{key}"] = th.as_tensor(drawn)
     if graph.mode is None:
         inputs[MODE] = th.arange(N_TRIED) % (graph.n_modes + 1) - 1
-    inputs[NOISE] = th.randn(N_TRIED, 2, diffusion.n_steps, diffusion.denoiser.action_in.in_features)
+    inputs[NOISE] = th.randn(N_TRIED, 2, diffusion.n_draws, diffusion.denoiser.action_dim)
     return inputs
 
 
@@ -274,6 +275,7 @@ def _metadata(model: Any, mode: int | None) -> dict[str, str]:
         "observation_space": _space(model.observation_space),
         "action_space": _space(model.action_space),
         "n_diffusion_steps": model.policy.actor.n_diffusion_steps,
+        "action_chunk": model.policy.action_chunk,
         "deterministic_noise": model.policy.fixed_noise(DETERMINISTIC_SAMPLES).transpose(0, 1).tolist(),
     }
     return {key: json.dumps(value, allow_nan=False) for key, value in said.items()}

@@ -1,6 +1,7 @@
 """DDiffPG's policy: a diffusion actor, the modes' critics and embeddings, and the choice of a mode to act."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,21 +11,27 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
+from sb3_ddiffpg.ddiffpg.action_plans import ActionPlans
 from sb3_ddiffpg.exploration.episode_scheduler import UNCONDITIONED
 from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
-from sb3_ddiffpg.networks.diffusion import DiffusionActor
+from sb3_ddiffpg.networks.diffusion_actor import DiffusionActor
 from sb3_ddiffpg.networks.policies import TwinCriticPolicy
-from sb3_ddiffpg.utils.observations import batch_size, repeated
+from sb3_ddiffpg.utils.observations import batch_size, repeated, rows_of
+from sb3_ddiffpg.utils.settings import at_least
 
 #: Actions among which the critics choose where a policy is to act without chance
 DETERMINISTIC_SAMPLES = 4
 
 
 class _Command(NamedTuple):
-    """What ``predict`` is asked for: the group of each row, and how many actions are drawn for each."""
+    """
+    What ``predict`` is asked for: the group of each row, or one for all, how many actions are drawn for each, and the plans
+    that are being followed, where actions are drawn in chunks.
+    """
 
     groups: np.ndarray | None
     n_samples: int
+    plans: ActionPlans | None = None
 
 
 _NO_COMMAND = _Command(None, 1)
@@ -46,7 +53,7 @@ class DiffusionPolicy(TwinCriticPolicy):
     :param optimizer_class: Optimiser of actor and critics
     :param optimizer_kwargs: Its keyword arguments, without the learning rate
     :param n_modes: Number of modes M
-    :param n_diffusion_steps: Number of diffusion steps T
+    :param n_diffusion_steps: Number of diffusion steps T; None: a flow, see ``DDiffPG``
     :param mode_embedding_dim: Size of a mode embedding
     :param time_embedding_dim: Size of a diffusion step's embedding
     :param n_critics: Critics per group
@@ -54,6 +61,8 @@ class DiffusionPolicy(TwinCriticPolicy):
     :param support: Lower and upper end of the values of the modes' critics
     :param exploration_support: The same for the exploratory critics
     :param twin_target: What the twins learn from, see ``ModeCritics``
+    :param action_chunk: Steps whose actions are said at once, and judged together by the critics: fewer calls of the policy,
+        and no look at what happens in between. Returns have at least so many steps
     """
 
     actor: DiffusionActor
@@ -72,7 +81,7 @@ class DiffusionPolicy(TwinCriticPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.AdamW,
         optimizer_kwargs: dict[str, Any] | None = None,
         n_modes: int = 0,
-        n_diffusion_steps: int = 5,
+        n_diffusion_steps: int | None = None,
         mode_embedding_dim: int = 5,
         time_embedding_dim: int = 32,
         n_critics: int = 2,
@@ -80,7 +89,9 @@ class DiffusionPolicy(TwinCriticPolicy):
         support: tuple[float, float] = (0.0, 5.0),
         exploration_support: tuple[float, float] = (0.0, 5.0),
         twin_target: str = "lower_mean",
+        action_chunk: int = 1,
     ) -> None:
+        at_least(1).check("action_chunk", action_chunk)
         super().__init__(
             observation_space,
             action_space,
@@ -91,6 +102,7 @@ class DiffusionPolicy(TwinCriticPolicy):
                 n_diffusion_steps=n_diffusion_steps,
                 mode_embedding_dim=mode_embedding_dim,
                 time_embedding_dim=time_embedding_dim,
+                action_chunk=action_chunk,
             ),
             net_arch=net_arch,
             critic_activation_fn=critic_activation_fn,
@@ -105,6 +117,7 @@ class DiffusionPolicy(TwinCriticPolicy):
             support=support,
             exploration_support=exploration_support,
             twin_target=twin_target,
+            action_chunk=action_chunk,
         )
         self._constructor.update(
             activation_fn=activation_fn,
@@ -115,6 +128,7 @@ class DiffusionPolicy(TwinCriticPolicy):
         self.mode_embeddings: th.Tensor
         self.register_buffer("mode_embeddings", th.randn(n_modes + 1, mode_embedding_dim))
         self._command = _NO_COMMAND
+        self._n_rows = 0  # of the latest observations
 
     @property
     def n_modes(self) -> int:
@@ -177,8 +191,9 @@ class DiffusionPolicy(TwinCriticPolicy):
         :param groups: Rows of the embedding table, ``UNCONDITIONED`` for the zero embedding, shape [N]
         :return: Shape [N, mode_embedding_dim]
         """
-        groups = th.as_tensor(groups, device=self.mode_embeddings.device).long()
-        return self.mode_embeddings[groups.clamp(min=0)] * (groups >= 0)[:, None]
+        embeddings = self.mode_embeddings
+        with_none = th.cat((embeddings, embeddings.new_zeros(1, embeddings.shape[1])))  # the last row is row UNCONDITIONED
+        return with_none[th.as_tensor(groups, device=embeddings.device).long()]
 
     def row_embeddings(self, n: int, mask_prob: float | None = None) -> th.Tensor:
         """
@@ -232,7 +247,22 @@ class DiffusionPolicy(TwinCriticPolicy):
         return values.unflatten(1, (-1, n_actions)).mean(dim=2)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        groups, n_samples = self._command
+        groups, n_samples, plans = self._command
+        n = self._n_rows = batch_size(observation)
+        if groups is not None:
+            if len(groups) not in (1, n):
+                raise ValueError(f"Got modes, state or episode_start of {len(groups)} for {n} observation(s)")
+            groups = np.repeat(groups, n // len(groups))
+        if plans is None:
+            return self._draw(observation, groups, n_samples, deterministic)
+        groups = np.full(n, UNCONDITIONED) if groups is None else groups
+        if len(over := plans.over(groups)):
+            drawn = self._draw(rows_of(observation, over), groups[over], n_samples, deterministic)
+            plans.make(over, groups[over], drawn.cpu().numpy())
+        return th.as_tensor(plans.next_actions(), device=self.mode_embeddings.device)
+
+    def _draw(self, observation: PyTorchObs, groups: np.ndarray | None, n_samples: int, deterministic: bool) -> th.Tensor:
+        """Actions in [-1, 1], those of a chunk one after the other, [N, action_chunk * action_dim]."""
         if n_samples == 1:
             embeddings = None if groups is None else self.group_embeddings(groups)
             return self.actor(observation, deterministic, embeddings)
@@ -242,13 +272,11 @@ class DiffusionPolicy(TwinCriticPolicy):
         """
         :param n_samples: Actions for each observation
         :return: What is denoised where a policy is to act without chance, the same at each call: nothing, and standard normal
-            draws, [T, n_samples, action_dim]
+            draws, [n_draws, n_samples, action_dim]
         """
         diffusion = self.actor.diffusion
-        shape = (diffusion.n_steps, n_samples, diffusion.denoiser.action_in.in_features)
-        noise = th.randn(shape, generator=th.Generator().manual_seed(0))  # on the CPU: other devices draw otherwise
-        noise[:, 0] = 0.0
-        return noise.to(self.mode_embeddings.device)
+        shape = (diffusion.n_draws, n_samples, diffusion.denoiser.action_dim)
+        return _fixed_noise(shape).to(self.mode_embeddings.device)
 
     @th.no_grad()
     def best_actions(
@@ -262,7 +290,7 @@ class DiffusionPolicy(TwinCriticPolicy):
         :param groups: Rows of the embedding table, ``UNCONDITIONED`` for none, [N]; None: none in any row
         :param n_samples: Actions for each, the first of which has no noise
         :param deterministic: Whether the others always have the same noise
-        :return: Actions in [-1, 1], [N, action_dim]
+        :return: Actions in [-1, 1], [N, action_chunk * action_dim]
         """
         n = batch_size(obs)
         groups = np.full(n, UNCONDITIONED) if groups is None else groups
@@ -271,15 +299,17 @@ class DiffusionPolicy(TwinCriticPolicy):
         if deterministic:
             noise = self.fixed_noise(n_samples)[:, None].expand(-1, n, -1, -1)
         else:
-            shape = (diffusion.n_steps, n, n_samples, diffusion.denoiser.action_in.in_features)
+            shape = (diffusion.n_draws, n, n_samples, diffusion.denoiser.action_dim)
             noise = th.randn(shape, device=condition.device)
             noise[:, :, 0] = 0.0
         noise = noise.flatten(1, 2)
         actions = diffusion.sample(condition.repeat_interleave(n_samples, 0), noise=noise).unflatten(0, (n, n_samples))
         features = self.extract_features(obs, self.critic_features_extractor)
         best = actions.new_empty(n, dtype=th.long)
-        for group in np.unique(groups).tolist():
-            rows = th.as_tensor(np.flatnonzero(groups == group), device=actions.device)
+        different = np.unique(groups).tolist()
+        for group in different:
+            alike = len(different) == 1
+            rows = slice(None) if alike else th.as_tensor(np.flatnonzero(groups == group), device=actions.device)
             judges = slice(group, group + 1) if group >= 0 else slice(1, None) if self.n_modes else slice(0, 1)
             repeated_features = features[rows].repeat_interleave(n_samples, 0)
             values = self.critics.values_by(judges, repeated_features, actions[rows].flatten(0, 1)).amax(dim=0)
@@ -300,7 +330,8 @@ class DiffusionPolicy(TwinCriticPolicy):
         Actions for one observation or a batch.
 
         :param observation: The observation(s)
-        :param state: The mode held by every environment, as returned by the previous call
+        :param state: As returned by the previous call: the mode held by every environment, and where actions are drawn in
+            chunks what is left of these
         :param episode_start: Which environments begin an episode and so draw a new mode
         :param deterministic: Without noise; the same call returns the same action
         :param mode: Index of the mode to follow, one for all or one per observation. None: a mode is drawn for every
@@ -324,20 +355,19 @@ class DiffusionPolicy(TwinCriticPolicy):
             n_samples = DETERMINISTIC_SAMPLES if deterministic else 1
         if not isinstance(n_samples, int | np.integer) or n_samples < 1:
             raise ValueError(f"n_samples: {n_samples!r} given; accepted are whole numbers from 1 up")
-        self._command = _Command(None, int(n_samples))
-        # A tuple is the mistake that SB3's predict explains
-        if group is not None and not isinstance(observation, tuple):
-            n_obs = self.obs_to_tensor(observation)[0]
-            n_rows = batch_size(n_obs)
-            if len(group) not in (1, n_rows):
-                raise ValueError(f"Got modes, state or episode_start of {len(group)} for {n_rows} observation(s)")
-            self._command = _Command(np.broadcast_to(group, (n_rows,)).copy(), int(n_samples))
-            if held is not None:
-                state = (np.broadcast_to(held, (n_rows,)).copy(),)
+        plans = None
+        if self.action_chunk > 1:
+            plans = ActionPlans(self.action_chunk, None if state is None else state[1:], episode_start)
+        self._command = _Command(group, int(n_samples), plans)
         try:
-            return super().predict(observation, state, episode_start, deterministic)
+            actions, state = super().predict(observation, state, episode_start, deterministic)
         finally:
             self._command = _NO_COMMAND
+        if held is None and plans is None:
+            return actions, state
+        held = np.array([UNCONDITIONED]) if held is None else held
+        followed = np.repeat(held, self._n_rows // len(held))
+        return actions, (followed,) if plans is None else (followed, *plans.state)
 
     def _draw_modes(self, state: tuple[np.ndarray, ...] | None, episode_start: np.ndarray | None) -> np.ndarray:
         """The modes to follow: kept through an episode, drawn uniformly at its start; -1 while there is none."""
@@ -345,7 +375,8 @@ class DiffusionPolicy(TwinCriticPolicy):
             held = np.full(len(np.atleast_1d(episode_start)), UNCONDITIONED)  # type: ignore[arg-type]
             starts = np.ones(len(held), dtype=bool)
         else:
-            held = np.array(state[0]) if isinstance(state, tuple) and len(state) == 1 else np.empty(0, dtype=object)
+            n_parts = 1 if self.action_chunk == 1 else 1 + len(ActionPlans.PARTS)
+            held = np.array(state[0]) if isinstance(state, tuple) and len(state) == n_parts else np.empty(0, dtype=object)
             if held.dtype.kind not in "iu" or held.ndim != 1:
                 raise ValueError(f"state must be what the previous call of predict returned, got {state!r}")
             starts = np.zeros(len(held), dtype=bool) if episode_start is None else np.atleast_1d(episode_start).astype(bool)
@@ -354,6 +385,13 @@ class DiffusionPolicy(TwinCriticPolicy):
         if self.n_modes:
             held[starts] = np.random.randint(0, self.n_modes, size=int(starts.sum()))
         return held
+
+
+@cache
+def _fixed_noise(shape: tuple[int, int, int]) -> th.Tensor:
+    noise = th.randn(shape, generator=th.Generator().manual_seed(0))  # on the CPU: other devices draw otherwise
+    noise[:, 0] = 0.0
+    return noise
 
 
 class CnnDiffusionPolicy(DiffusionPolicy):

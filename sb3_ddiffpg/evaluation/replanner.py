@@ -98,7 +98,7 @@ class Replanner:
         """
         :param observation: One observation or a batch of N
         :param state: What the previous call returned: the rank of every environment's mode, where it moved last, the steps
-            since then, and which modes have failed
+            since then, which modes have failed, and the model's own state
         :param episode_start: Which environments begin an episode
         :param deterministic: Passed to the model
         :return: The actions and the state for the next call
@@ -110,7 +110,7 @@ class Replanner:
         n = len(positions)
         if state is None:
             state, episode_start = self._fresh(n, positions), np.ones(n, dtype=bool)
-        rank, anchor, still, failed = (part.copy() for part in state)
+        rank, anchor, still, failed = (part.copy() for part in state[:4])
         if len(rank) != n:
             raise ValueError(f"state: of {len(rank)} environment(s) given for {n} observation(s)")
         begins = np.zeros(n, dtype=bool) if episode_start is None else np.asarray(episode_start, dtype=bool).reshape(n)
@@ -136,8 +136,11 @@ class Replanner:
         anchor[stuck], still[stuck] = positions[stuck], 0
 
         modes = self.ranked[rank]
-        actions, _ = self.model.predict(batch, deterministic=deterministic, mode=modes)
-        return actions[0] if is_single else actions, (rank, anchor, still, failed)
+        # What the model is in the middle of, it goes on with, unless the mode is another now
+        actions, followed = self.model.predict(
+            batch, state=state[4:] or None, episode_start=begins, deterministic=deterministic, mode=modes
+        )
+        return actions[0] if is_single else actions, (rank, anchor, still, failed, *(followed or ()))
 
     def _as_batch(self, observation: Any) -> tuple[Any, bool]:
         space = self.model.observation_space

@@ -245,8 +245,8 @@ class ExplorationBonus:
         :return: The rewards, [G, n], and numbers to log
         """
         settings = self.settings
-        inputs = self._inputs(visited, encode)
-        now, then = (self.novelty_model.novelty(*each) for each in inputs)
+        positions, seen = self._inputs(visited, encode)
+        now, then = self.novelty_model.novelty(positions, seen).chunk(2)
         reward = watch.finite("the novelty", noveld_reward(now, then, settings.scale), 0.0)
         reward = reward * self._bonus_mask(visited)
         metrics = {"intrinsic_reward": reward.mean()}
@@ -259,7 +259,7 @@ class ExplorationBonus:
             scale = self.moments.var.sqrt() + 1e-8
             reward = (reward / scale).clamp(max=settings.clip)
         if self.novelty_model.optimizer is not None:
-            metrics["novelty_loss"] = self.novelty_model.update(*inputs[1])
+            metrics["novelty_loss"] = self.novelty_model.update(positions.chunk(2)[1], seen.chunk(2)[1])
         present = visited.present
         places = th.from_numpy(np.flatnonzero(present)).to(self.device, non_blocking=True)
         rewards = reward.new_zeros(present.size).index_copy(0, places, reward).view(present.shape)
@@ -272,13 +272,13 @@ class ExplorationBonus:
         rewards[1:] *= mode_gamma**steps
         return settings.coef * rewards.sum(dim=-1).float(), metrics
 
-    def _inputs(self, visited: VisitedSteps, encode: Any) -> list[tuple[th.Tensor, th.Tensor]]:
-        """What the measure sees of the states before and after each step: positions and features."""
-        pairs = ((visited.positions, visited.observations), (visited.next_positions, visited.next_observations))
+    def _inputs(self, visited: VisitedSteps, encode: Any) -> tuple[th.Tensor, th.Tensor]:
+        """What the measure sees of the states before each step and then of those after it: positions and features."""
+        positions = th.cat((visited.positions, visited.next_positions))
         if not getattr(self.novelty_model, "with_observation", False):
-            return [(positions, positions) for positions, _ in pairs]
+            return positions, positions
         with th.no_grad():
-            return [(positions, encode(observations)) for positions, observations in pairs]
+            return positions, th.cat([encode(each) for each in (visited.observations, visited.next_observations)])
 
     def _bonus_mask(self, visited: VisitedSteps) -> th.Tensor:
         """Where novelty is paid, of the N steps that there are."""

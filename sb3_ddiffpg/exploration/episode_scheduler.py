@@ -18,6 +18,8 @@ UNCONDITIONED = -1
 PATIENCE = 10
 # So many times as many places are news
 MORE_CELLS = 1.05
+# More actions than any chunk has: of a plan that is over
+_DONE = 2**31
 
 
 class _State(msgspec.Struct, forbid_unknown_fields=True):
@@ -28,6 +30,7 @@ class _State(msgspec.Struct, forbid_unknown_fields=True):
     n_turns: Count
     news_at: Count = 0
     n_cells: Count = 0
+    plans: list[np.ndarray] | None = None
 
 
 class EpisodeScheduler:
@@ -53,6 +56,8 @@ class EpisodeScheduler:
         self.explored = np.zeros(n_envs, dtype=bool)
         self.handed_over = np.zeros(n_envs, dtype=bool)
         self.may_hand_over = np.zeros(n_envs, dtype=bool)
+        #: Where actions are drawn in chunks, what is left of these: the parts of ``ActionPlans``
+        self.plans: tuple[np.ndarray, ...] | None = None
 
     def exploration_share(self, progress_remaining: float, step: int = 0) -> float:
         """
@@ -99,6 +104,8 @@ class EpisodeScheduler:
         :param env: Index of the environment
         :param exploration_share: Probability that the episode explores
         """
+        if self.plans is not None:
+            self.plans[2][env] = _DONE
         self.groups[env] = group = self.draw(exploration_share)
         self.explored[env] = group == EXPLORATORY_GROUP
         self.handed_over[env] = False
@@ -152,13 +159,16 @@ class EpisodeScheduler:
         :param new_modes: New index of every old mode, None if it is gone
         """
         groups = {old + 1: UNCONDITIONED if new is None else new + 1 for old, new in enumerate(new_modes)}
-        self.groups = np.array([groups.get(group, group) for group in self.groups.tolist()], dtype=np.int64)
+        self.groups = _renumbered(self.groups, groups)
+        if self.plans is not None:
+            self.plans = _renumbered(self.plans[0], groups), *self.plans[1:]
 
     def state_dict(self) -> dict[str, Any]:
         """
         :return: Who drives what, for ``load_state_dict``
         """
-        return {name: getattr(self, name) for name in _State.__struct_fields__}
+        known = {name: getattr(self, name) for name in _State.__struct_fields__}
+        return {**known, "plans": None if self.plans is None else list(self.plans)}
 
     def load_state_dict(self, state: Any, n_envs: int) -> None:
         """
@@ -177,3 +187,20 @@ class EpisodeScheduler:
         for name in _State.__struct_fields__:
             value = getattr(known, name)
             setattr(self, name, value.copy() if isinstance(value, np.ndarray) else value)
+        self.plans = None if known.plans is None else _checked_plans(known.plans, n_envs)
+
+
+def _renumbered(groups: np.ndarray, new: dict[int, int]) -> np.ndarray:
+    return np.array([new.get(group, group) for group in groups.tolist()], dtype=np.int64)
+
+
+def _checked_plans(plans: list[np.ndarray], n_envs: int) -> tuple[np.ndarray, ...]:
+    """
+    :raises ValueError: If they are of other environments, or no plans
+    """
+    names = ("groups", "actions", "done")
+    if len(plans) != len(names) or plans[1].ndim != 3:
+        raise ValueError(f"episodes.plans: arrays of {[each.shape for each in plans]} given; accepted are {names}")
+    for name, each, dtype in zip(names, plans, (np.int64, np.float32, np.int64), strict=True):
+        check_array(each, dtype, [n_envs, *each.shape[1:]], f"episodes.plans.{name}")
+    return tuple(each.copy() for each in plans)

@@ -49,9 +49,9 @@ class RunningMoments(nn.Module):
         """
         self.count.add_(values.shape[0]).clamp_(max=self.max_count)
         share = (values.shape[0] / self.count).clamp(max=1.0)
-        delta = values.mean(dim=0) - self.mean
-        self.var += share * (values.var(dim=0, unbiased=False) + (1 - share) * delta.pow(2) - self.var)
-        self.mean += share * delta
+        variance, mean = th.var_mean(values, dim=0, correction=0)
+        self.var.lerp_(th.addcmul(variance, 1 - share, (mean - self.mean).square()), share)
+        self.mean.lerp_(mean, share)
 
     def standardize(self, values: th.Tensor) -> th.Tensor:
         """

@@ -3,10 +3,9 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 
-import numpy as np
 import torch as th
 from torch import nn
 from torch.nn import functional as F
@@ -17,8 +16,6 @@ TWIN_TARGETS = ("lower_mean", "elementwise")
 #: Row of everything that is kept by group: 0 explores, m + 1 is mode m
 EXPLORATORY_GROUP = 0
 ALL_GROUPS = slice(None)
-# Rows of a group from which on it pays on a processor to go back through the lower twin only
-LARGE_ASCENT = 128
 # What optimisers call the mean of the gradients
 DIRECTIONS = ("exp_avg", "momentum_buffer")
 
@@ -88,7 +85,7 @@ class ModeCritics(nn.Module):
 
     def _kind(self) -> th.Tensor:
         """Row of the support tables for every group, shape [G]."""
-        return th.arange(self.n_groups, device=self.atoms.device).clamp(max=1)
+        return _kinds(self.n_groups, self.atoms.device)
 
     @th.no_grad()
     def _reset_output(self, group: int, zero_weights: bool = True) -> None:
@@ -111,21 +108,26 @@ class ModeCritics(nn.Module):
         :param frozen: Whether the weights are constants, which makes a gradient with respect to the actions cheaper
         :return: Logits over the atoms (values when scalar), shape [G, C, n, n_atoms]
         """
-        return self._layers(th.cat((features, actions), dim=2), self._stacked(frozen))[-1]
+        return self._outputs(th.cat((features, actions), dim=2), self._stacked(frozen))
 
     def _stacked(self, frozen: bool) -> list[tuple[th.Tensor, th.Tensor]]:
         """Weights [G * C, in, out] and biases [G * C, 1, out] of all layers."""
         layers = [[parameter.flatten(0, 1) for parameter in layer] for layer in zip(self.weights, self.biases, strict=True)]
         return [(weight.detach(), bias.detach()) if frozen else (weight, bias) for weight, bias in layers]
 
+    def _outputs(self, inputs: th.Tensor, parameters: list[tuple[th.Tensor, th.Tensor]]) -> th.Tensor:
+        """Of all critics of g groups, [g, C, n, n_atoms], whose rows are [g, n, in]."""
+        shared = inputs[:, None].expand(-1, self.n_critics, -1, -1).flatten(0, 1)  # [g * C, n, in]
+        return self._layers(shared, parameters)[-1].unflatten(0, (-1, self.n_critics))
+
     def _layers(self, inputs: th.Tensor, parameters: list[tuple[th.Tensor, th.Tensor]]) -> list[th.Tensor]:
-        """What every layer gives before its activation, [G, C, n, width] each."""
+        """What every layer gives before its activation, [N, n, width] each, of N networks whose rows are [N, n, in]."""
         layers: list[th.Tensor] = []
-        hidden = inputs[:, None].expand(-1, self.n_critics, -1, -1).flatten(0, 1)  # [G, n, in] -> [G * C, n, in]
+        hidden = inputs
         for weight, bias in parameters:
             layers.append(th.baddbmm(bias, hidden, weight))
             hidden = self.activation(layers[-1]) if len(layers) < len(parameters) else hidden
-        return [layer.unflatten(0, (-1, self.n_critics)) for layer in layers]
+        return layers
 
     def values(self, logits: th.Tensor, groups: slice = ALL_GROUPS) -> th.Tensor:
         """
@@ -147,7 +149,7 @@ class ModeCritics(nn.Module):
         layers = zip(self.weights, self.biases, strict=True)
         parameters = [(weight[groups].flatten(0, 1), bias[groups].flatten(0, 1)) for weight, bias in layers]
         inputs = th.cat((features, actions), dim=1).expand(len(parameters[0][0]) // self.n_critics, -1, -1)
-        return self.values(self._layers(inputs, parameters)[-1], groups).min(dim=1).values
+        return self.values(self._outputs(inputs, parameters), groups).min(dim=1).values
 
     @th.no_grad()
     def bellman_target(self, features: th.Tensor, actions: th.Tensor, rewards: th.Tensor, discounts: th.Tensor) -> th.Tensor:
@@ -162,18 +164,20 @@ class ModeCritics(nn.Module):
         :return: Target probabilities, shape [G, n, n_atoms]; scalar targets, shape [G, n, 1], when ``n_atoms=1``
         """
         logits = self(features, actions)
-        values, lower_twin = self.values(logits).min(dim=1)  # [G, n]
         kind = self._kind()
         low, high = self.lower[kind][:, None], self.upper[kind][:, None]  # [G, 1]
         if self.n_atoms == 1:
+            values = logits.squeeze(-1).amin(dim=1)  # [G, n]
             return (rewards + discounts * values).clamp(low, high)[..., None]
+        twins = logits.softmax(dim=-1)  # [G, C, n, n_atoms]
+        atoms = self.atoms[kind][:, None, :]
         if self.twin_target == "elementwise":
-            twins = logits.softmax(dim=-1).unbind(dim=1)
-            projections = [project_distribution(twin, self.atoms[kind][:, None, :], rewards, discounts) for twin in twins]
+            projections = [project_distribution(twin, atoms, rewards, discounts) for twin in twins.unbind(dim=1)]
             return th.stack(projections).amin(dim=0).clamp(0.0, 1.0)  # rounding can exceed one
+        lower_twin = (twins * atoms[:, None]).sum(dim=-1).argmin(dim=1)  # [G, n]
         index = lower_twin[:, None, :, None].expand(-1, 1, -1, self.n_atoms)
-        probabilities = logits.gather(1, index).squeeze(1).softmax(dim=-1)  # [G, n, n_atoms]
-        return project_distribution(probabilities, self.atoms[kind][:, None, :], rewards, discounts)
+        probabilities = twins.gather(1, index).squeeze(1)  # [G, n, n_atoms]
+        return project_distribution(probabilities, atoms, rewards, discounts)
 
     def loss(self, features: th.Tensor, actions: th.Tensor, targets: th.Tensor) -> th.Tensor:
         """
@@ -204,36 +208,29 @@ class ModeCritics(nn.Module):
 
     def action_gradient(self, features: th.Tensor) -> Callable[[th.Tensor], th.Tensor]:
         """
-        The gradient of min(Q1, Q2) with respect to each row's own action: it does not depend on the batch's size.
+        The gradient of each group's first critic, as in TD3's actor, with respect to each row's own action: it does not depend
+        on the batch's size.
 
         :param features: Shape [G, n, F]
         :return: The gradient as a function of the actions, [G, n, A] to [G, n, A]
         """
-        (weight, bias), *others = self._stacked(frozen=True)
-        shared = features[:, None].expand(-1, self.n_critics, -1, -1).flatten(0, 1)
+        layers = zip(self.weights, self.biases, strict=True)
+        (weight, bias), *others = [(weight.detach()[:, 0], bias.detach()[:, 0]) for weight, bias in layers]
         # The features' part of the first layer is the same at every step of an ascent
-        parameters = [(weight[:, self.features_dim :], th.baddbmm(bias, shared, weight[:, : self.features_dim])), *others]
-        if features.device.type == "cpu" and features.shape[1] >= LARGE_ASCENT:
-            return partial(self._lower_twin_gradient, parameters)
-        return partial(self._masked_gradient, parameters)
+        first = weight[:, self.features_dim :], th.baddbmm(bias, features, weight[:, : self.features_dim])
+        return partial(self._first_critics_gradient, [first, *others])
 
     @th.no_grad()
-    def _masked_gradient(self, parameters: list[tuple[th.Tensor, th.Tensor]], actions: th.Tensor) -> th.Tensor:
-        """By hand, half of autograd's kernels: back through both twins, of which the higher one gets zeros."""
-        *hidden, logits = self._layers(actions, parameters)
-        probabilities = logits.softmax(dim=-1)
-        atoms = self.atoms[self._kind()][:, None, None, :]
-        # values() would take the softmax again
-        values = logits if self.n_atoms == 1 else (probabilities * atoms).sum(dim=-1, keepdim=True)  # [G, C, n, 1]
-        twins = th.arange(self.n_critics, device=logits.device)[:, None, None]
-        is_lower = values.argmin(dim=1, keepdim=True) == twins
-        backward = is_lower.to(logits.dtype)
-        if self.n_atoms > 1:
-            backward = probabilities * (atoms - values) * backward
-        backward = backward.flatten(0, 1)
+    def _first_critics_gradient(self, parameters: list[tuple[th.Tensor, th.Tensor]], actions: th.Tensor) -> th.Tensor:
+        """By hand, half of autograd's kernels."""
+        *hidden, output = self._layers(actions, parameters)
+        backward = th.ones_like(output)
+        if self.n_atoms > 1:  # of the expected value with respect to the logits: p (z - E z)
+            probabilities, atoms = output.softmax(dim=-1), self.atoms[self._kind()][:, None, :]
+            backward = probabilities * (atoms - (probabilities * atoms).sum(dim=-1, keepdim=True))
         for (weight, _), before in zip(parameters[:0:-1], hidden[::-1], strict=True):
-            backward = self._through_activation(th.bmm(backward, weight.mT), before.flatten(0, 1))
-        return th.bmm(backward, parameters[0][0].mT).unflatten(0, (-1, self.n_critics)).sum(dim=1)
+            backward = self._through_activation(th.bmm(backward, weight.mT), before)
+        return th.bmm(backward, parameters[0][0].mT)
 
     def _through_activation(self, gradient: th.Tensor, before: th.Tensor) -> th.Tensor:
         """
@@ -248,31 +245,6 @@ class ModeCritics(nn.Module):
         before = before.detach().requires_grad_()
         with th.enable_grad():
             return th.autograd.grad(self.activation(before), before, gradient)[0]
-
-    @th.no_grad()
-    def _lower_twin_gradient(self, parameters: list[tuple[th.Tensor, th.Tensor]], actions: th.Tensor) -> th.Tensor:
-        """
-        The same, going back through the lower twin of each row only: half the products, but the rows must be sorted by twin,
-        which takes many small operations, and on an accelerator would wait for it.
-        """
-        *hidden, logits = self._layers(actions, parameters)
-        lower_twin = self.values(logits).min(dim=1).indices  # [G, n]
-        gradient = th.empty_like(actions)
-        for group, twin in np.ndindex(*logits.shape[:2]):
-            rows = (lower_twin[group] == twin).nonzero().squeeze(1)
-            net = group * self.n_critics + twin
-            # Of the expected value with respect to the logits: p (z - E z); of a scalar value: 1
-            backward = logits.new_ones(len(rows), 1)
-            if self.n_atoms > 1:
-                atoms = self.atoms[min(group, 1)]
-                probabilities = logits[group, twin].index_select(0, rows).softmax(dim=-1)
-                backward = probabilities * (atoms - (probabilities @ atoms)[:, None])
-            for layer in range(len(hidden), 0, -1):
-                backward = backward @ parameters[layer][0][net].T
-                before = hidden[layer - 1][group, twin].index_select(0, rows)
-                backward = self._through_activation(backward, before)
-            gradient[group].index_copy_(0, rows, backward @ parameters[0][0][net].T)
-        return gradient
 
     @th.no_grad()
     def inherit(
@@ -345,12 +317,16 @@ class ModeCritics(nn.Module):
         :return: What each norm was, [G]
         """
         gradients = [parameter.grad for parameter in self.stacked_parameters() if parameter.grad is not None]
-        squares = th.stack([gradient.flatten(1).pow(2).sum(dim=1) for gradient in gradients])
-        norms = squares.sum(dim=0).sqrt()  # [G]
-        scale = (max_norm / (norms + 1e-6)).clamp(max=1.0)
+        norms = th.stack([th.linalg.vector_norm(gradient, dim=(1, 2, 3)) for gradient in gradients]).norm(dim=0)  # [G]
+        scale = (max_norm / (norms + 1e-6)).clamp(max=1.0)[:, None, None, None]
         for gradient in gradients:
-            gradient.mul_(scale[:, None, None, None])
+            gradient.mul_(scale)
         return norms
+
+
+@cache
+def _kinds(n_groups: int, device: th.device) -> th.Tensor:
+    return th.arange(n_groups, device=device).clamp(max=1)
 
 
 def project_distribution(probabilities: th.Tensor, atoms: th.Tensor, rewards: th.Tensor, discounts: th.Tensor) -> th.Tensor:
@@ -366,11 +342,13 @@ def project_distribution(probabilities: th.Tensor, atoms: th.Tensor, rewards: th
     """
     n_atoms = atoms.shape[-1]
     low, high = atoms[..., :1], atoms[..., -1:]
-    moved = (rewards[..., None] + discounts[..., None] * atoms).clamp(low, high)
-    position = (moved - low) / ((high - low) / (n_atoms - 1))
-    left = position.floor().clamp(0, n_atoms - 2)
-    right_share = (position - left) * probabilities
-    index = left.long()
-    projected = th.zeros_like(probabilities)
-    projected.scatter_add_(-1, index, probabilities - right_share)
-    return projected.scatter_add_(-1, index + 1, right_share)
+    step = (high - low) / (n_atoms - 1)
+    # Where every atom comes to lie, counted in atoms from the lower end
+    first = (rewards[..., None] + (discounts[..., None] - 1.0) * low) / step
+    position = th.addcmul(first, discounts[..., None], th.arange(n_atoms, device=atoms.device)).clamp_(0, n_atoms - 1)
+    left = position.long()
+    right_share = (position - left).mul_(probabilities)
+    # One atom more: to the right of the last one there is nothing, and nothing comes there
+    projected = probabilities.new_zeros(*probabilities.shape[:-1], n_atoms + 1)
+    projected.scatter_add_(-1, left, probabilities - right_share).scatter_add_(-1, left + 1, right_share)
+    return projected[..., :n_atoms]

@@ -165,6 +165,7 @@ class TwinCriticPolicy(SavablePolicy):
     :param support: Lower and upper end of the values of all groups but the first
     :param exploration_support: The same for the first
     :param twin_target: What the twins learn from, see ``ModeCritics``
+    :param action_chunk: Steps whose actions are judged together, one after the other
     """
 
     actor: Any
@@ -191,6 +192,7 @@ class TwinCriticPolicy(SavablePolicy):
         support: tuple[float, float] = (0.0, 5.0),
         exploration_support: tuple[float, float] = (0.0, 5.0),
         twin_target: str = "lower_mean",
+        action_chunk: int = 1,
     ) -> None:
         super().__init__(
             observation_space,
@@ -209,7 +211,9 @@ class TwinCriticPolicy(SavablePolicy):
             support=support,
             exploration_support=exploration_support,
             twin_target=twin_target,
+            action_chunk=action_chunk,
         )
+        self.action_chunk = action_chunk
         actor_arch, critic_arch = get_actor_critic_arch([128, 128] if net_arch is None else net_arch)
         extractor = self.make_features_extractor()
         make_actor: Any = actor_class
@@ -224,7 +228,7 @@ class TwinCriticPolicy(SavablePolicy):
         )
         critic_arguments: dict[str, Any] = dict(
             features_dim=extractor.features_dim,
-            action_dim=int(np.prod(action_space.shape)),
+            action_dim=action_chunk * int(np.prod(action_space.shape)),
             net_arch=critic_arch,
             n_groups=n_groups,
             activation_fn=critic_activation_fn,
@@ -280,6 +284,8 @@ class TwinCriticPolicy(SavablePolicy):
         """
         :param mode: True for training, False for evaluation (dropout, batch norm of the extractors)
         """
+        if mode == self.training:
+            return  # to look into every module takes a fifth of an action's time
         self.actor.set_training_mode(mode)
         self.critics.train(mode)
         self.critic_features_extractor.train(mode)

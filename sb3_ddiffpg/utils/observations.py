@@ -20,3 +20,16 @@ def repeated(observations: Any, n: int) -> Any:
     if isinstance(observations, dict):
         return {key: repeated(each, n) for key, each in observations.items()}
     return observations.repeat_interleave(n, 0)
+
+
+def rows_of(observations: Any, rows: Any) -> Any:
+    """
+    :param observations: Arrays or tensors of N of them, or a dict of such
+    :param rows: Indices of some
+    :return: Those
+    """
+    return (
+        {key: rows_of(each, rows) for key, each in observations.items()}
+        if isinstance(observations, dict)
+        else observations[rows]
+    )

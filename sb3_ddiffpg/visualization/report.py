@@ -39,10 +39,10 @@ def film(model: Any, task: Task, mode: str | None, seed: int, max_frames: int = 
     :raises ValueError: If the environment draws no pictures
     """
     env = task.make(1, seed, render_mode="rgb_array")
-    observation: Any = env.reset()
+    observation, state = env.reset(), None
     frames, done = [env.get_images()[0]], False
     while not done and len(frames) < max_frames and isinstance(frames[0], np.ndarray):
-        action, _ = model.predict(observation, mode=mode)
+        action, state = model.predict(observation, state, mode=mode)
         observation, _, dones, _ = env.step(action)
         done = bool(dones[0])
         if not done:  # then the next episode has begun

@@ -341,7 +341,7 @@ def test_dipo_updates_as_ddiffpg_without_modes_does():
     settings = {"policy_kwargs": {"net_arch": [16, 16]}, "target_action": {"n_steps": 3, "learning_rate": 0.1}}
     dipo, ours = (
         small(DIPO, learning_starts=10**6, **settings),
-        small(DDiffPG, modes={"embedding_dim": 1}, exploration={"v_max": 5.0}, **settings),
+        small(DDiffPG, modes={"embedding_dim": 1}, exploration={"v_max": 5.0}, n_diffusion_steps=5, **settings),
     )
     dipo.learn(40)
     state = dipo.policy.state_dict()

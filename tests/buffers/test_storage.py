@@ -147,7 +147,6 @@ def test_an_update_never_waits_for_the_device(settings, stored_on_device, monkey
     def refuse(*_, **__):
         raise AssertionError("this waits for the device")
 
-    monkeypatch.setattr("sb3_ddiffpg.networks.critics.LARGE_ASCENT", 10**9)
     model.divergence_watch = DivergenceWatch(th.device("cuda"))  # looks later
     model.replay_buffer.storage_device = th.device("cuda")  # only asked whether target actions must come back
     metrics = defaultdict(list)

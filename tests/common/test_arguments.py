@@ -526,7 +526,7 @@ def test_other_arguments_are_checked_at_once():
     for wrong, said in (
         ({"gamma": 1.5}, r"gamma must lie in \[0, 1\], got 1.5"),
         ({"gamma": 0.5, "batch_size": "3"}, "batch_size must be an integer of at least 1, got '3'"),
-        ({"n_diffusion_steps": 0}, "n_diffusion_steps must be an integer of at least 1, got 0"),
+        ({"recluster_freq": 0}, "recluster_freq must be an integer of at least 1, got 0"),
         ({"mode_trials": 0}, "modes.trials must be an integer of at least 1, got 0"),
         ({"critic": {"v_maks": 3}}, r"critic\['v_maks'\] is no setting: did you mean 'v_max'"),
     ):

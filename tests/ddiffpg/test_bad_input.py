@@ -32,12 +32,13 @@ from sb3_ddiffpg.evaluation.rollout import run_episodes
 from sb3_ddiffpg.utils.divergence import DivergedError
 
 NUMBERS_FROM_ONE = (
-    *("n_diffusion_steps", "recluster_freq", "batch_size", "buffer_size", "critic.n_critics", "critic.n_atoms"),
+    *("recluster_freq", "batch_size", "buffer_size", "critic.n_critics", "critic.n_atoms"),
     *("target_action.n_steps", "modes.max_modes", "modes.min_size"),
     *("modes.max_successes", "modes.max_failures", "modes.embedding_dim", "modes.trials"),
 )
 BAD_ARGUMENTS = [
     *((name, value) for name in NUMBERS_FROM_ONE for value in (0, -1, 1.5, None, "many", True)),
+    *(("n_diffusion_steps", value) for value in (0, -1, 1.5, "many", True)),
     *((name, value) for name in ("learning_starts", "modes.patience") for value in (-1, 0.5, None, "x")),
     *((name, value) for name in ("gamma", "tau", "modes.mask_prob", "exploration.fraction") for value in (-0.1, 1.1, "x")),
     *((name, None) for name in ("gamma", "tau", "modes.mask_prob")),
@@ -140,7 +141,7 @@ def test_bad_arguments(argument, value):
             {"batch_size": 10, "modes": {"max_modes": 10}},
             r"batch_size=10 is smaller than the number of groups.*modes.max_modes \+ 1 = 11",
         ),
-        ({"n_diffusion_steps": 0}, "n_diffusion_steps must be an integer of at least 1, got 0"),
+        ({"n_diffusion_steps": 0}, "n_diffusion_steps must be an integer of at least 1, or be None, got 0"),
         ({"gamma": 1.1}, r"gamma must lie in \[0, 1\], got 1.1"),
         ({"modes": {"linkage": "ward"}}, r"modes.linkage must be one of \['average', .*\], got 'ward'"),
         (

@@ -15,7 +15,7 @@ N_SAMPLES = 3
 
 def trained_on(n_atoms):
     env = DummyVecEnv([lambda: TwoEnds()] * 4)
-    return small_model(env, critic={"n_atoms": n_atoms}).learn(400)
+    return small_model(env, critic={"n_atoms": n_atoms}).learn(800)
 
 
 @pytest.fixture(scope="module", params=[51, 1], ids=["distributional", "scalar"])

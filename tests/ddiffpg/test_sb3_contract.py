@@ -406,19 +406,17 @@ def test_networks_without_hidden_layers(net_arch, tmp_path):
     features, actions = th.randn(critics.n_groups, 200, 2), th.rand(critics.n_groups, 200, 1, requires_grad=True)
     if not actor_arch:
         assert len(denoiser.trunk) == 0
-        parts = [layer.weight for layer in (denoiser.condition_in, denoiser.action_in, denoiser.time_in)]
-        condition, noisy, times = th.randn(3, parts[0].shape[1]), th.randn(3, 1), denoiser.time_mlp(denoiser.steps[:3])
-        by_hand = th.cat((condition, noisy, times), dim=1) @ th.cat(parts, dim=1).T + denoiser.condition_in.bias
-        th.testing.assert_close(denoiser(noisy, denoiser.condition_in(condition), denoiser.time_table()[:3]), by_hand)
+        parts = [layer.weight for layer in (denoiser.condition_in, denoiser.action_in)]
+        condition, noisy, times = th.randn(2, parts[0].shape[1]), th.randn(2, 1), denoiser.time_table()
+        by_hand = th.cat((condition, noisy), dim=1) @ th.cat(parts, dim=1).T + denoiser.condition_in.bias + times
+        th.testing.assert_close(denoiser(noisy, denoiser.condition_in(condition), times), by_hand)
     if len(critics.weights) == 1:
         inputs = th.cat((features, actions), dim=2)
         by_hand = th.einsum("gni,gcia->gcna", inputs, critics.weights[0]) + critics.biases[0]
         th.testing.assert_close(critics(features, actions), by_hand)
-    # The ascent's gradient by autograd, for many rows and for few
-    for n in (200, 20):
-        part = actions[:, :n]
-        (expected,) = th.autograd.grad(critics.values(critics(features[:, :n], part)).amin(dim=1).sum(), part)
-        th.testing.assert_close(critics.action_gradient(features[:, :n])(part.detach()), expected, atol=1e-5, rtol=1e-4)
+    # The ascent's gradient by autograd
+    (expected,) = th.autograd.grad(critics.values(critics(features, actions))[:, 0].sum(), actions)
+    th.testing.assert_close(critics.action_gradient(features)(actions.detach()), expected, atol=1e-5, rtol=1e-4)
     model.export(tmp_path / "model.safetensors")
     loaded = DDiffPG.load(tmp_path / "model.safetensors", safe=True)
     expected, _ = model.predict(some_observations(), deterministic=True)

@@ -34,7 +34,7 @@ class Stub:
     def get_vec_normalize_env(self):
         return None
 
-    def predict(self, obs, deterministic=False, mode=None):
+    def predict(self, obs, state=None, episode_start=None, deterministic=False, mode=None):
         return np.asarray(mode)[:, None].astype(np.float32), None
 
     def mode_values(self, obs):

@@ -469,7 +469,7 @@ def test_the_papers_settings_pay_past_modes():
 @pytest.fixture
 def able():
     """A model whose two modes know their routes, which explorers are not paid beyond."""
-    model = small_model(DummyVecEnv([TwoEnds] * 4), exploration={"past_modes": False}).learn(240)
+    model = small_model(DummyVecEnv([TwoEnds] * 4), exploration={"past_modes": False}).learn(600)
     make_able(model, range(len(model.modes)))
     assert len(model.bonus.routes.numbers()) == 2
     return model

@@ -5,7 +5,8 @@ import pytest
 import torch as th
 from diffusers import DDPMScheduler
 
-from sb3_ddiffpg.networks.diffusion import Denoiser, DiffusionModel, SinusoidalEmbedding, squared_cosine_betas
+from sb3_ddiffpg.networks.denoiser import Denoiser, SinusoidalEmbedding
+from sb3_ddiffpg.networks.diffusion import DiffusionModel, squared_cosine_betas
 
 
 def make_model(n_steps: int = 5, condition_dim: int = 3, action_dim: int = 2, width: int = 32) -> DiffusionModel:
@@ -61,7 +62,8 @@ def test_noising_equals_diffusers():
     actions, noise, steps = th.rand(64, 2) * 2 - 1, th.randn(64, 2), th.randint(n_steps, (64,))
     seen = []
     model.denoiser.trunk = th.nn.Identity()
-    model.denoiser.action_in = th.nn.Identity()
+    model.denoiser.action_in = th.nn.Linear(2, 2, bias=False)
+    th.nn.init.eye_(model.denoiser.action_in.weight)
     model.denoiser.condition_in = th.nn.Linear(3, 2)
     model.denoiser.time_in = th.nn.Linear(32, 2)
     for parameters in (model.denoiser.condition_in.parameters(), model.denoiser.time_in.parameters()):

@@ -74,7 +74,7 @@ def hyperparams(**changes):
 def logs(tmp_path_factory):
     """A folder in which an agent was trained, with everything the zoo can write on the way."""
     folder = tmp_path_factory.mktemp("zoo")
-    command = ["train", "--env", ENV, "-n", "800", "--n-envs", "4", "--seed", "2", "-f", str(folder)]
+    command = ["train", "--env", ENV, "-n", "800", "--n-envs", "4", "--seed", "0", "-f", str(folder)]
     command += ["-tb", str(folder / "tb"), "--eval-freq", "400", "--eval-episodes", "2", "--save-freq", "400"]
     main([*command, "--save-replay-buffer", *ENV_KWARGS, *hyperparams()])
     return folder
