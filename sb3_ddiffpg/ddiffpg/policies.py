@@ -81,7 +81,7 @@ class DiffusionPolicy(TwinCriticPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.AdamW,
         optimizer_kwargs: dict[str, Any] | None = None,
         n_modes: int = 0,
-        n_diffusion_steps: int | None = None,
+        n_diffusion_steps: int | None = 5,
         mode_embedding_dim: int = 5,
         time_embedding_dim: int = 32,
         n_critics: int = 2,

@@ -108,11 +108,10 @@ def test_numbers(exported):
 
 
 def test_noise_is_an_input(exported):
-    """By denoising with the same noise: [T, N, A] there, [N, 1, T, A] in the file; of a flow T is 1."""
+    """By denoising with the same noise: [T, N, A] there, [N, 1, T, A] in the file."""
     model, path = exported
-    assert model.policy.actor.diffusion.n_draws == 1
     inputs, observations = sampled(model.observation_space, 50)
-    noise, modes = np.random.standard_normal((50, 1, 1, 1)).astype(np.float32), np.arange(50) % 3 - 1
+    noise, modes = np.random.standard_normal((50, 1, 5, 1)).astype(np.float32), np.arange(50) % 3 - 1
     (found,) = session(path).run(["action"], {**inputs, "mode": modes, "noise": noise})
     embeddings = model.policy.group_embeddings(np.where(modes < 0, -1, modes + 1))
     with th.no_grad():
@@ -122,10 +121,17 @@ def test_noise_is_an_input(exported):
     assert len(np.unique(found)) > 30
 
 
+def test_a_flow_takes_one_draw_for_each_action(tmp_path):
+    model, path = small_model(DummyVecEnv([TwoEnds] * 4), n_diffusion_steps=None).learn(600), tmp_path / "model.onnx"
+    model.export_onnx(path)
+    assert about(path)["n_diffusion_steps"] is None and np.shape(about(path)["deterministic_noise"]) == (4, 1, 1)
+    assert_equal_to_predict(model, path, *sampled(model.observation_space, 100))
+
+
 def test_the_file_says_what_it_is(exported):
     model, path = exported
     said = about(path)
-    assert said["sb3_ddiffpg"] == sb3_ddiffpg.__version__ and said["n_diffusion_steps"] is None
+    assert said["sb3_ddiffpg"] == sb3_ddiffpg.__version__ and said["n_diffusion_steps"] == 5
     assert said["observation_space"] == {"shape": [2], "dtype": "float32", "low": -2.0, "high": 2.0}
     assert said["action_space"] == {"shape": [1], "dtype": "float32", "low": -1.0, "high": 1.0}
     first = model.modes[0]

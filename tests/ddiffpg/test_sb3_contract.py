@@ -407,7 +407,7 @@ def test_networks_without_hidden_layers(net_arch, tmp_path):
     if not actor_arch:
         assert len(denoiser.trunk) == 0
         parts = [layer.weight for layer in (denoiser.condition_in, denoiser.action_in)]
-        condition, noisy, times = th.randn(2, parts[0].shape[1]), th.randn(2, 1), denoiser.time_table()
+        condition, noisy, times = th.randn(5, parts[0].shape[1]), th.randn(5, 1), denoiser.time_table()
         by_hand = th.cat((condition, noisy), dim=1) @ th.cat(parts, dim=1).T + denoiser.condition_in.bias + times
         th.testing.assert_close(denoiser(noisy, denoiser.condition_in(condition), times), by_hand)
     if len(critics.weights) == 1:

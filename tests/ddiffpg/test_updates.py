@@ -220,7 +220,7 @@ def test_target_actions_climb_their_own_critic(optimizer):
     def values(actions):
         with th.no_grad():
             features = model.policy.critic_features(batch.observations)
-            return model.critics.values(model.critics(features, actions)).min(dim=1).values
+            return model.critics.values(model.critics(features, actions))[:, 0]
 
     improved = model._improve_target_actions(batch)
     gain = (values(improved) - values(batch.target_actions)).mean(dim=1)
@@ -232,6 +232,29 @@ def test_target_actions_climb_their_own_critic(optimizer):
         distinct, counts = np.unique(rows[group], return_counts=True)
         drawn_once = np.isin(rows[group], distinct[counts == 1])
         np.testing.assert_array_equal(stored[drawn_once], improved[group].numpy()[drawn_once])
+
+
+@pytest.mark.parametrize(("n_diffusion_steps", "expected"), [(None, 5), (5, 11)])
+def test_a_flow_learns_at_every_second_update(n_diffusion_steps, expected, monkeypatch):
+    """However many there are at a time."""
+    model = trained_model(n_diffusion_steps=n_diffusion_steps)
+    before, calls, original = model._n_updates, [], model._update_policy
+    monkeypatch.setattr(model, "_update_policy", lambda *args: calls.append(1) or original(*args))
+    model._n_updates = 0
+    for n in (1, 3, 1, 1, 5):
+        model.train(n, 60)
+    assert len(calls) == expected and model._n_updates == 11 and before
+
+
+def test_a_flow_is_saved_as_one(tmp_path):
+    model = trained_model(n_diffusion_steps=None)
+    model.save(tmp_path / "model")
+    model.export(tmp_path / "model.safetensors")
+    seen = np.random.default_rng(0).uniform(-1, 1, (9, 2)).astype(np.float32)
+    expected, _ = model.predict(seen, deterministic=True, mode=0)
+    for loaded in (DDiffPG.load(tmp_path / "model"), DDiffPG.load(tmp_path / "model.safetensors", safe=True)):
+        assert loaded.n_diffusion_steps is None and loaded.actor.diffusion.n_draws == 1
+        np.testing.assert_array_equal(loaded.predict(seen, deterministic=True, mode=0)[0], expected)
 
 
 def test_metrics_of_an_update():
