@@ -134,13 +134,15 @@ def small(seconds: float, device: str) -> None:
     td3 = TD3("MlpPolicy", env, batch_size=256, learning_starts=10**9, buffer_size=50_000, policy_kwargs=hidden, device=device)
     td3.set_logger(configure(None, []))
     td3.learn(20_000, log_interval=10**9)
-    # Both train the policy at every other update
-    twice = {"DDiffPG": lambda: [model.train(1, 256) for _ in "12"], "TD3": lambda: [td3.train(1, 256) for _ in "12"]}
-    found = {name: value / 2 for name, value in median_ms(twice, seconds, device).items()}
+    flow = filled(4, 2, gamma=0.97, exploration={"n_steps": 3}, device=device, n_diffusion_steps=None)
+    # TD3 and a flow train the policy at every other update
+    calls: dict[str, Any] = {"DDiffPG": model, "DDiffPG, a flow of two steps": flow, "SB3 TD3": td3}
+    pairs = {name: lambda each=each: [each.train(1, 256) for _ in range(2)] for name, each in calls.items()}
+    found = {name: value / 2 for name, value in median_ms(pairs, seconds, device).items()}
     print("\nsmall networks (128-128), batch 256, 2 modes                ms")
     print_parts(model, 256)
-    print(f"  {'a whole update':<48} {found['DDiffPG']:9.2f}")
-    print(f"  {'SB3 TD3, a whole update':<48} {found['TD3']:9.2f}   {found['DDiffPG'] / found['TD3']:.2f}x")
+    for name, value in found.items():
+        print(f"  {name + ', a whole update':<48} {value:9.2f}   {value / found['SB3 TD3']:.2f}x")
 
 
 def check_equal(model: DDiffPG, plain: PlainUpdate) -> None:

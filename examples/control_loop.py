@@ -45,7 +45,7 @@ class Policy:
                 index = -1 if mode is None else self.names.index(mode)
                 inputs["mode"] = np.array([index], np.int64)
             action = self.session.run(["action"], {**inputs, "noise": self.noise})[0][0]
-            self.plan, self.followed = list(action) if self.about["action_chunk"] > 1 else [action], mode
+            self.plan, self.followed = list(action) if self.about.get("action_chunk", 1) > 1 else [action], mode
         return self.plan.pop(0)
 
 
