@@ -167,12 +167,15 @@ class ModeReplayBuffer(AssignedReplayBuffer):
         chunks = windows[..., : self.action_chunk]
         steps = self._on_device(self.steps.tensors(rows.ravel()))
         nexts = self._on_device(self.nexts.tensors(returns.last.ravel()))
-        actions, executed = self._chunked(steps, "actions", chunks)
+        executed = None
+        if self.action_chunk > 1:
+            steps, executed = self._with_later_actions(steps, chunks)
+        actions = steps["actions"].view(*rows.shape, -1)
         on_route = np.where(returns.lost, -1, windows)
         return ModeBatch(
             observations=self.normalized(with_goals(self._as_observation(steps, "observations"), relabelling), env),
             actions=actions,
-            target_actions=self._target_actions(steps, actions, chunks, relabelling),
+            target_actions=self._target_actions(steps, actions, relabelling),
             next_observations=self.normalized(with_goals(self._as_observation(nexts, "next_observations"), relabelling), env),
             rewards=self._to_device(returns.rewards.astype(np.float32)),
             discounts=self._to_device(returns.discounts.astype(np.float32)),
@@ -187,32 +190,26 @@ class ModeReplayBuffer(AssignedReplayBuffer):
             visited=self.visited(on_route if visits_of_modes else on_route[:1, :, :exploration_n_steps]),
         )
 
-    def _chunked(
-        self, steps: dict[str, th.Tensor], name: str, chunks: np.ndarray, instead: th.Tensor | None = None
-    ) -> tuple[th.Tensor, th.Tensor | None]:
+    def _with_later_actions(self, steps: dict[str, th.Tensor], chunks: np.ndarray) -> tuple[dict[str, th.Tensor], th.Tensor]:
         """
-        A field with an action in it of the steps of chunks, one after the other, [G, n, k * action_dim], and which of them
-        there were, None if all. Where the episode was over before, ``instead``, or by chance: it matters not what else was
-        to be done.
+        Steps [N, ...] whose actions, also the target ones, are those of all steps of their chunks, one after the other,
+        [N, k * action_dim], and which of these there were, [G, n, k * action_dim]. Where the episode was over before, they
+        are by chance: it matters not what else was to be done.
         """
-        first = steps[name].view(*chunks.shape[:2], self.action_dim)
-        if self.action_chunk == 1:
-            return first, None
-        there = chunks[..., 1:].ravel() >= 0
-        others = self._on_device(self.steps.tensors(np.maximum(chunks[..., 1:].ravel(), 0)))[name]
-        values = th.cat((first[..., None, :], others.view(*chunks.shape[:2], -1, self.action_dim)), dim=2).flatten(2)
-        executed = th.ones_like(values)
-        executed[..., self.action_dim :] = self._to_device(
-            there.reshape(*chunks.shape[:2], -1).repeat(self.action_dim, axis=-1)
-        )
-        instead = 2 * th.rand_like(values) - 1 if instead is None else instead
-        return th.where(executed > 0, values, instead), executed
+        later = chunks[..., 1:].reshape(len(steps["actions"]), -1)  # [N, k - 1]
+        read = self._on_device(self.steps.tensors(np.maximum(later.ravel(), 0)))
+        executed = th.ones_like(steps["actions"]).repeat(1, self.action_chunk)
+        executed[:, self.action_dim :] = self._to_device((later >= 0).repeat(self.action_dim, axis=-1))
+        instead = 2 * th.rand_like(executed) - 1
+        whole = {
+            name: th.where(executed > 0, th.cat((steps[name], read[name].reshape(len(later), -1)), dim=1), instead)
+            for name in ("actions", *self.target_action_fields)
+        }
+        return {**steps, **whole}, executed.view(*chunks.shape[:2], -1)
 
-    def _target_actions(
-        self, steps: dict[str, th.Tensor], actions: th.Tensor, chunks: np.ndarray, relabelling: Any = None
-    ) -> th.Tensor:
+    def _target_actions(self, steps: dict[str, th.Tensor], actions: th.Tensor, relabelling: Any = None) -> th.Tensor:
         """Of the exploratory group, and of each mode its own, like the actions; these where none are stored."""
-        stored = [self._chunked(steps, name, chunks, actions)[0] for name in self.target_action_fields]
+        stored = [steps[name].view(actions.shape) for name in self.target_action_fields]
         if not stored:
             return actions
         targets = th.cat((stored[-1][:1], stored[0][1:]))

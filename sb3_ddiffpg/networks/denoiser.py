@@ -97,6 +97,36 @@ class Denoiser(nn.Module):
         return self.trunk(th.addmm(condition_part + time_part, actions, self.action_in.weight.T))
 
 
+class ActionModel(nn.Module):
+    """What makes actions of noise by a denoiser: a diffusion or a flow."""
+
+    #: The network that is asked
+    denoiser: Denoiser
+
+    def denoise(self, condition: th.Tensor, deterministic: bool = False, noise: th.Tensor | None = None) -> th.Tensor:
+        """
+        See the subclass.
+
+        :param condition: Shape [N, condition_dim]
+        :param deterministic: Whether no noise is drawn
+        :param noise: The noise to use; drawn when None
+        :return: Actions in [-1, 1], shape [N, action_dim]
+        """
+        raise NotImplementedError
+
+    @th.no_grad()
+    def sample(self, condition: th.Tensor, deterministic: bool = False, noise: th.Tensor | None = None) -> th.Tensor:
+        """
+        As ``denoise``, without gradients.
+
+        :param condition: Shape [N, condition_dim]
+        :param deterministic: See ``denoise``
+        :param noise: See ``denoise``
+        :return: Actions in [-1, 1], shape [N, action_dim]
+        """
+        return self.denoise(condition, deterministic, noise)
+
+
 def weighted_mean(squares: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
     """
     :param squares: Of errors, [N, action_dim]

@@ -4,9 +4,8 @@ import math
 from collections.abc import Callable
 
 import torch as th
-from torch import nn
 
-from sb3_ddiffpg.networks.denoiser import Denoiser, weighted_mean
+from sb3_ddiffpg.networks.denoiser import ActionModel, Denoiser, weighted_mean
 
 
 def squared_cosine_betas(n_steps: int, max_beta: float = 0.999) -> th.Tensor:
@@ -38,7 +37,7 @@ def variance_preserving_betas(n_steps: int, low: float = 0.1, high: float = 10.0
 NOISE_SCHEDULES: dict[str, Callable[[int], th.Tensor]] = {"cosine": squared_cosine_betas, "vp": variance_preserving_betas}
 
 
-class DiffusionModel(nn.Module):
+class DiffusionModel(ActionModel):
     """
     Denoising diffusion of actions in [-1, 1] with epsilon prediction, clipped x0 and fixed posterior variance.
 
@@ -73,18 +72,6 @@ class DiffusionModel(nn.Module):
         self._sigma = (betas * (1 - previous) / (1 - alpha_bar)).sqrt().tolist()
         self.register_buffer("sqrt_alpha_bar", alpha_bar.sqrt().float(), persistent=False)
         self.register_buffer("sqrt_one_minus_alpha_bar", (1 - alpha_bar).sqrt().float(), persistent=False)
-
-    @th.no_grad()
-    def sample(self, condition: th.Tensor, deterministic: bool = False, noise: th.Tensor | None = None) -> th.Tensor:
-        """
-        As ``denoise``, without gradients.
-
-        :param condition: Shape [N, condition_dim]
-        :param deterministic: See ``denoise``
-        :param noise: See ``denoise``
-        :return: Actions in [-1, 1], shape [N, action_dim]
-        """
-        return self.denoise(condition, deterministic, noise)
 
     def denoise(self, condition: th.Tensor, deterministic: bool = False, noise: th.Tensor | None = None) -> th.Tensor:
         """

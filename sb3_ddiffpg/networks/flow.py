@@ -3,9 +3,8 @@
 from itertools import pairwise
 
 import torch as th
-from torch import nn
 
-from sb3_ddiffpg.networks.denoiser import Denoiser, weighted_mean
+from sb3_ddiffpg.networks.denoiser import ActionModel, Denoiser, weighted_mean
 
 #: When the flow asks for its velocity. With the first time alone, a policy that may go left or right at a fork would go
 #: straight on: seen from pure noise, an action is the mean of all. The second decides; a later one than half-way more clearly,
@@ -13,7 +12,7 @@ from sb3_ddiffpg.networks.denoiser import Denoiser, weighted_mean
 FLOW_TIMES = (1.0, 0.5)
 
 
-class FlowModel(nn.Module):
+class FlowModel(ActionModel):
     """
     Rectified flow of actions in [-1, 1]: ``x_t = (1 - t) a + t z`` leads from noise z at t = 1 to an action a at t = 0. The
     network learns its velocity ``z - a``, at those times alone at which sampling asks for it.
@@ -29,18 +28,6 @@ class FlowModel(nn.Module):
         super().__init__()
         self.denoiser = denoiser
         self.register_buffer("times", th.tensor(FLOW_TIMES), persistent=False)
-
-    @th.no_grad()
-    def sample(self, condition: th.Tensor, deterministic: bool = False, noise: th.Tensor | None = None) -> th.Tensor:
-        """
-        As ``denoise``, without gradients.
-
-        :param condition: Shape [N, condition_dim]
-        :param deterministic: See ``denoise``
-        :param noise: See ``denoise``
-        :return: Actions in [-1, 1], shape [N, action_dim]
-        """
-        return self.denoise(condition, deterministic, noise)
 
     def denoise(self, condition: th.Tensor, deterministic: bool = False, noise: th.Tensor | None = None) -> th.Tensor:
         """
