@@ -471,9 +471,9 @@ class DDiffPG(ActorCriticAlgorithm):
         :param state: What the previous call returned: the mode that every environment follows
         :param episode_start: Which environments begin an episode
         :param deterministic: Without chance: the same call returns the same action
-        :param mode: Name or index of the mode to follow, or one for each observation. None: a mode is drawn for each episode
-            and kept through it by ``state`` and ``episode_start``; without those, the zero embedding, which leaves the
-            choice to the policy at every step
+        :param mode: Name or index of the mode to follow, or one for each observation. None: a mode is drawn for each episode,
+            of those that are not plainly worse than the best, and kept through it by ``state`` and ``episode_start``; without
+            those, the zero embedding, which leaves the choice to the policy at every step
         :param n_samples: Of so many actions for each observation take that which the mode's critics like best (without a mode,
             those of any). One of them has no noise, and where ``deterministic`` the others always have the same. None: 4 where
             ``deterministic``, else 1
@@ -487,7 +487,11 @@ class DDiffPG(ActorCriticAlgorithm):
             if not single and len(mode) == 0:  # type: ignore[arg-type]
                 raise ValueError(f"mode={mode!r} is unknown: it names no mode")
             indices = table.index(mode) if single else np.array([table.index(each) for each in mode])  # type: ignore[arg-type, union-attr]
-        return self.policy.predict(observation, state, episode_start, deterministic, mode=indices, n_samples=n_samples)
+        begins = episode_start is not None and (state is None or np.any(episode_start))
+        among = self.mode_manager.trusted() if begins and mode is None else None
+        return self.policy.predict(
+            observation, state, episode_start, deterministic, mode=indices, n_samples=n_samples, among=among
+        )
 
     def _training_actions(self) -> np.ndarray:
         length = self.mode_manager.mean_length()

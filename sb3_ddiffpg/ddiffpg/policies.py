@@ -325,6 +325,7 @@ class DiffusionPolicy(TwinCriticPolicy):
         mode: int | np.ndarray | None = None,
         group: np.ndarray | None = None,
         n_samples: int | None = None,
+        among: Sequence[int] | None = None,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """
         Actions for one observation or a batch.
@@ -338,6 +339,7 @@ class DiffusionPolicy(TwinCriticPolicy):
             episode (given ``state`` or ``episode_start``), else the zero embedding
         :param group: Rows of the embedding table, overrides ``mode``; for training
         :param n_samples: See ``DDiffPG.predict``
+        :param among: Indices of the modes of which one is drawn for an episode; None: of all
         :return: The actions in the action space's bounds, and the state for the next call
         """
         held = None
@@ -346,7 +348,7 @@ class DiffusionPolicy(TwinCriticPolicy):
             if held.dtype.kind not in "iu" or held.ndim != 1 or held.min(initial=0) < 0:
                 raise ValueError(f"mode={mode!r} is unknown; modes are numbered from 0 to {self.n_modes - 1}")
         elif group is None and (state is not None or episode_start is not None):
-            held = self._draw_modes(state, episode_start)
+            held = self._draw_modes(state, episode_start, range(self.n_modes) if among is None else among)
         if held is not None:
             if held.max(initial=UNCONDITIONED) >= self.n_modes:
                 raise ValueError(f"mode={held.max()} (or the one in state) is unknown; this policy has {self.n_modes} modes")
@@ -369,8 +371,10 @@ class DiffusionPolicy(TwinCriticPolicy):
         followed = np.repeat(held, self._n_rows // len(held))
         return actions, (followed,) if plans is None else (followed, *plans.state)
 
-    def _draw_modes(self, state: tuple[np.ndarray, ...] | None, episode_start: np.ndarray | None) -> np.ndarray:
-        """The modes to follow: kept through an episode, drawn uniformly at its start; -1 while there is none."""
+    def _draw_modes(
+        self, state: tuple[np.ndarray, ...] | None, episode_start: np.ndarray | None, among: Sequence[int]
+    ) -> np.ndarray:
+        """The modes to follow: kept through an episode, at its start drawn uniformly of these; -1 while there is none."""
         if state is None:
             held = np.full(len(np.atleast_1d(episode_start)), UNCONDITIONED)  # type: ignore[arg-type]
             starts = np.ones(len(held), dtype=bool)
@@ -382,8 +386,8 @@ class DiffusionPolicy(TwinCriticPolicy):
             starts = np.zeros(len(held), dtype=bool) if episode_start is None else np.atleast_1d(episode_start).astype(bool)
             if len(starts) != len(held):
                 raise ValueError(f"episode_start is given for {len(starts)} environment(s), state for {len(held)}")
-        if self.n_modes:
-            held[starts] = np.random.randint(0, self.n_modes, size=int(starts.sum()))
+        if len(among):
+            held[starts] = np.asarray(among)[np.random.randint(0, len(among), size=int(starts.sum()))]
         return held
 
 

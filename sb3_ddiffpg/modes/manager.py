@@ -11,7 +11,16 @@ from sb3_ddiffpg.buffers.trajectory import NO_MODE, Trajectory
 from sb3_ddiffpg.clustering.linkage import cluster
 from sb3_ddiffpg.modes.discovery import find_modes, readmit_homeless, retired_modes, surpassed_modes
 from sb3_ddiffpg.modes.history import ModeEvent, ModeHistory, succeed
-from sb3_ddiffpg.modes.mode import Mode, ModeTable, Outcome, check_name, default_name, modes_from_state, modes_state
+from sb3_ddiffpg.modes.mode import (
+    Mode,
+    ModeTable,
+    Outcome,
+    check_name,
+    default_name,
+    modes_from_state,
+    modes_state,
+    outclassed,
+)
 from sb3_ddiffpg.modes.settings import ModeSettings
 from sb3_ddiffpg.serialization.safetensors_tree import Count, convert
 
@@ -85,6 +94,13 @@ class ModeManager:
             go on with
         """
         return {index: mode.number for index, mode in enumerate(self.modes) if mode.success_rate >= MASTERED_SUCCESS_RATE}
+
+    def trusted(self) -> list[int]:
+        """
+        :return: Indices of the modes that a policy without command may follow: all that are not plainly worse than the best
+        """
+        worse = outclassed(self.modes, self.success_is_told)
+        return [index for index in range(len(self)) if index not in worse]
 
     # ------------------------------------------------------------------ finding
 

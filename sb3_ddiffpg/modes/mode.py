@@ -8,9 +8,13 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from scipy.stats import mannwhitneyu
 
 from sb3_ddiffpg.serialization.safetensors_tree import Count, check_array, convert
 
+#: Latest commanded episodes by which modes are compared, and what makes one worse than the best: the share of the pairs of an
+#: episode of each that it loses (ties count half), and how seldom that may be chance
+COMPARED_EPISODES, OUTCLASSED, CHANCE = 30, 0.75, 0.01
 # A name stands in tables, legends, on command lines (where a number would be an index) and in tags of a log that cuts them
 ACCEPTED_NAME = re.compile(r"(?!_)(?=.*[^\W\d])[\w .+-]{1,24}")
 
@@ -104,6 +108,25 @@ class Mode:
 
     def _mean(self, name: str) -> float:
         return float(np.mean([getattr(outcome, name) for outcome in self.outcomes])) if self.outcomes else float("nan")
+
+
+def outclassed(modes: Sequence[Mode], by_success: bool) -> set[int]:
+    """
+    Modes that are plainly worse than the best one, by a Mann-Whitney test of their latest commanded training episodes.
+
+    :param modes: Of a model
+    :param by_success: Whether episodes are compared by whether they succeeded, else by their returns
+    :return: Indices; without evidence none
+    """
+    kinds = "success" if by_success else "episode_return"
+    scores = [np.array([getattr(each, kinds) for each in mode.outcomes][-COMPARED_EPISODES:], dtype=float) for mode in modes]
+    best = max((each for each in scores if len(each)), key=np.mean, default=np.zeros(0))
+
+    def is_worse(own: np.ndarray) -> bool:
+        wins = np.sign(best[:, None] - own).mean() / 2 + 0.5 if len(own) else 0.5
+        return wins > OUTCLASSED and mannwhitneyu(best, own, alternative="greater", method="asymptotic").pvalue < CHANCE
+
+    return {index for index, own in enumerate(scores) if is_worse(own)}
 
 
 class _State(msgspec.Struct, forbid_unknown_fields=True):

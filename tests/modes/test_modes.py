@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 import torch as th
 from environments import TwoEnds, change_settings, fill, small_model, some_observations
+from hypothesis import given
+from hypothesis import strategies as st
 from planar import ROUTES, belongings, planar_model, route_of, said, same, walk
+from scipy.stats import mannwhitneyu
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_ddiffpg import Mode, ModeTable
 from sb3_ddiffpg.buffers.trajectory import NO_MODE
 from sb3_ddiffpg.exploration.episode_scheduler import UNCONDITIONED
-from sb3_ddiffpg.modes.mode import Outcome
+from sb3_ddiffpg.modes.mode import Outcome, outclassed
 from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
 
 # ---------------------------------------------------------------------- commanding
@@ -89,6 +92,51 @@ def test_a_drawn_mode_is_kept_until_the_episode_ends(trained):
     again, same = trained.predict(observations, state=state, deterministic=True)
     np.testing.assert_array_equal(same[0], state[0])
     assert again.shape == actions.shape
+
+
+def outcomes(scores):
+    """Commanded episodes of such returns, of which those of 1 are successes."""
+    return [Outcome(score == 1, float(score), 10) for score in scores]
+
+
+@pytest.mark.parametrize(
+    ("best", "other", "by_success", "worse"),
+    [
+        ([1] * 30, [0] * 30, True, True),
+        ([1] * 30, [0, 1] * 15, True, False),  # half as often: it loses half of the pairs and draws the others
+        ([1] * 30, [0] * 18 + [1] * 12, True, True),
+        ([1] * 3, [0] * 3, True, False),  # by chance alone in one of twenty such sixes
+        ([1] * 30, [], True, False),
+        ([5] * 30, [3] * 30, True, False),  # whoever has never succeeded is no better for its returns
+        ([5] * 30, [3] * 30, False, True),
+        ([0, 5] * 15, [-1, 4] * 15, False, False),  # as -140 and -160 of a pendulum, of which each is 80 more or less
+        ([-7] * 80 + [3] * 30, [-9] * 80 + [3] * 30, False, False),  # what they were once does not count
+    ],
+)
+def test_a_mode_that_is_plainly_worse_is_not_drawn(two_routes, best, other, by_success, worse):
+    model = two_routes
+    for index, scores in enumerate((best, other)):
+        model.mode_manager.modes[index].outcomes.extend(outcomes(scores))
+    model.mode_manager.success_is_told = by_success
+    observations, begins = np.zeros((64, 2), dtype=np.float32), np.ones(64, dtype=bool)
+    _, state = model.predict(observations, episode_start=begins)
+    assert set(state[0]) == ({0} if worse else {0, 1})
+    _, state = model.predict(observations, state, episode_start=begins)
+    assert set(state[0]) == ({0} if worse else {0, 1})
+    _, state = model.predict(observations, episode_start=begins, mode=1)
+    assert set(state[0]) == {1}
+
+
+@given(st.lists(st.integers(0, 3), min_size=1, max_size=40), st.lists(st.integers(0, 3), min_size=1, max_size=40))
+def test_who_is_plainly_worse(first, second):
+    modes = [Mode(number, f"mode_{number}", born_at=0) for number in range(2)]
+    for mode, scores in zip(modes, (first, second), strict=True):
+        mode.outcomes.extend(outcomes(scores))
+    latest = [first[-30:], second[-30:]]
+    worse = int(np.mean(latest[0]) >= np.mean(latest[1]))
+    pairs = [(won > lost) + (won == lost) / 2 for won in latest[1 - worse] for lost in latest[worse]]
+    chance = mannwhitneyu(latest[1 - worse], latest[worse], alternative="greater", method="asymptotic").pvalue
+    assert outclassed(modes, by_success=False) == ({worse} if np.mean(pairs) > 0.75 and chance < 0.01 else set())
 
 
 def test_a_commanded_mode_is_kept_too(trained):
