@@ -78,14 +78,19 @@ class Denoiser(nn.Module):
         for size_in, size_out in pairwise([*net_arch, action_dim]):
             trunk += [activation_fn(), nn.Linear(size_in, size_out)]
         self.trunk = nn.Sequential(*trunk)
-        self.steps: th.Tensor
-        self.register_buffer("steps", th.arange(n_steps), persistent=False)
+        # The steps are always the same; only what is made of their embedding changes
+        self.embedded_steps: th.Tensor
+        self.register_buffer("embedded_steps", self.time_mlp[0](th.arange(n_steps)), persistent=False)
 
     def time_table(self) -> th.Tensor:
         """
         :return: The first layer's time part for every diffusion step, shape [T, net_arch[0]]
         """
-        return self.time_in(self.time_mlp(self.steps))
+        part = self.embedded_steps
+        _, *layers = self.time_mlp
+        for layer in layers:
+            part = layer(part)
+        return self.time_in(part)
 
     def forward(self, actions: th.Tensor, condition_part: th.Tensor, time_part: th.Tensor) -> th.Tensor:
         """

@@ -94,10 +94,10 @@ class DiffusionModel(ActionModel):
         time_table = self.denoiser.time_table()
         for t in reversed(range(self.n_steps)):
             epsilon = self.denoiser(actions, condition_part, time_table[t])
-            x0 = (self._x0_scale[t] * actions - self._noise_scale[t] * epsilon).clamp(-1.0, 1.0)
-            actions = self._mean_x0[t] * x0 + self._mean_xt[t] * actions
+            x0 = th.add(self._x0_scale[t] * actions, epsilon, alpha=-self._noise_scale[t]).clamp(-1.0, 1.0)
+            actions = th.add(self._mean_x0[t] * x0, actions, alpha=self._mean_xt[t])
             if t > 0 and noise is not None and not deterministic:
-                actions = actions + self._sigma[t] * noise[self.n_steps - t]
+                actions = th.add(actions, noise[self.n_steps - t], alpha=self._sigma[t])
         return actions
 
     def loss(
