@@ -93,6 +93,9 @@ def train(arguments: Sequence[str]) -> None:
     parser.add_argument("--resume", nargs="?", const="")
     parser.add_argument("--vec-env", choices=["dummy", "subproc", "ray"], default="dummy")
     known, rest = _read(parser, arguments)
+    for each in known.hyperparams:
+        if not each.partition(":")[2]:
+            raise SystemExit(f"--hyperparams: {each!r} given; accepted is name:value, such as gamma:0.97")
     hyperparams = [*known.hyperparams, *([] if known.n_envs is None else [f"n_envs:{known.n_envs}"])]
     if hyperparams:
         rest += ["--hyperparams", *hyperparams]

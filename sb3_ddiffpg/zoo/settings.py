@@ -59,6 +59,9 @@ def check_hyperparameters(algo: str, keys: Sequence[str]) -> None:
     for key in keys:
         if key in arguments or key in ZOO_KEYS or (own and _is_setting(ALGOS[algo], key)):
             continue
-        near = difflib.get_close_matches(key, sorted(arguments | ZOO_KEYS))
-        hint = f"did you mean {' or '.join(map(repr, near))}?" if near else f"it takes {', '.join(sorted(arguments))}"
+        group, name = (single_setting(ALGOS[algo], key) if own else None) or ("", key)
+        taken, who = (groups_of(ALGOS[algo])[group].names(), group) if group else (sorted(arguments), "it")
+        near = difflib.get_close_matches(name, [*taken, *([] if group else ZOO_KEYS)])
+        meant = [repr(f"{group}.{each}" if group else each) for each in near]
+        hint = f"did you mean {' or '.join(meant)}?" if near else f"{who} takes {', '.join(taken)}"
         raise TypeError(f"{key!r} is not a hyperparameter of {algo}: {hint}")

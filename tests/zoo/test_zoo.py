@@ -213,6 +213,12 @@ def test_settings_that_are_no_python(tmp_path):
             main(["train", "--env", ENV, "-f", str(tmp_path), *options])
 
 
+@pytest.mark.parametrize("given", ["gamma=0.9", "gamma", "gamma:"])
+def test_hyperparameters_without_a_value(tmp_path, given):
+    with pytest.raises(SystemExit, match=f"--hyperparams: '{given}' given; accepted is name:value"):
+        main(["train", "--env", ENV, "-f", str(tmp_path), "--hyperparams", "batch_size:64", given])
+
+
 def test_resuming_refuses_unknown_keys(run, tmp_path):
     # the zoo would set an attribute that nobody reads
     with pytest.raises(TypeError, match="'recluster_frq' is not a hyperparameter of ddiffpg: did you mean 'recluster_freq'"):
@@ -226,7 +232,9 @@ def test_resuming_refuses_unknown_keys(run, tmp_path):
         ("action_learning_rate", "learning_rate"),
         ("seed", "not a hyperparameter"),
         ("zzz", "it takes action_noise, .*, critic, .*, modes, "),
-        ("critic.zzz", "not a hyperparameter"),
+        ("critic.zzz", "critic takes n_critics, n_atoms, "),
+        ("critic.natoms", "did you mean 'critic.n_atoms'"),
+        ("novelty.cell_size", "novelty takes measure, kwargs, "),
         ("switch_mode", "not a hyperparameter"),
     ],
 )
