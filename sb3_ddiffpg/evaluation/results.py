@@ -188,7 +188,10 @@ class ModeEvaluation:
             f" {self.effective_modes:.2f} effective, coverage {coverage}; control accuracy {accuracy}",
         ]
         if self.label_source == "clustering":
-            lines.append("The environment gives no labels: routes are clusters of these very episodes' paths")
+            told = "The environment gives no labels: routes are clusters of these very episodes' paths"
+            successes = sum(row.n_successes for row in rows)
+            alone = successes - sum(sum(row.labels.values()) for row in rows)
+            lines.append(told + (f", but for {alone} of {successes}, which are like too few others" if alone else ""))
         if self.start_spread > 1e-3:
             lines.append(f"Episodes start up to {self.start_spread:.3g} apart: the start may decide on the route")
         return "\n".join(lines)

@@ -163,6 +163,14 @@ def test_where_nobody_labels_ways_are_clusters(trained):
     assert [each.mode for each in found.commanded] == trained.modes.names
 
 
+def test_successes_that_are_like_too_few_others_are_told():
+    rows = (replace(result("one", 10, {"cluster 0": 7}), n_successes=9), result("two", 10, {"cluster 1": 10}))
+    found = replace(evaluation({"cluster 0": 5}, 10, rows), label_source="clustering")
+    assert "clusters of these very episodes' paths, but for 2 of 24, which are like too few others" in str(found)
+    assert "but for" not in str(replace(found, commanded=rows[1:]))
+    assert "but for" not in str(replace(found, label_source="environment"))
+
+
 def test_without_word_of_success_every_episode_counts():
     env = DummyVecEnv([lambda: AnySpaces(spaces.Box(-1.0, 1.0, (2,)))] * 2)
     found = evaluate_modes(small_model(env), env, 3)
