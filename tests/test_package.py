@@ -104,7 +104,7 @@ def test_configuration_comes_from_the_installed_package(installed):
 
 
 def test_import_is_cheap(installed):
-    heavy = "mujoco", "pybullet", "gymnasium_robotics", "matplotlib", "rl_zoo3", "ray"
+    heavy = "mujoco", "pybullet", "gymnasium_robotics", "matplotlib", "rl_zoo3", "ray", "scipy.signal", "scipy.stats"
     code = f"import sys, sb3_ddiffpg, sb3_ddiffpg.envs; print([name for name in {heavy} if name in sys.modules])"
     assert run_installed(installed, code) == "[]"
 

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from sb3_ddiffpg.networks.critics import EXPLORATORY_GROUP
 
@@ -90,6 +89,8 @@ def discounted_returns(rewards: np.ndarray, gamma: float, then: str = "ends") ->
         as count; or it ``"stays"`` at its goal, see ``group_returns``
     :return: From each step on, the last first, same shape
     """
+    from scipy.signal import lfilter  # as long to import as half of torch; who only acts needs none
+
     latest_first = np.array(rewards[::-1], dtype=np.float64)
     if gamma < 1 and then == "goes on":
         latest_first[0] += gamma / (1 - gamma) * latest_first[: round(1 / (1 - gamma))].mean()

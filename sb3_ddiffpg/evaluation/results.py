@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import binomtest
 
 from sb3_ddiffpg.evaluation.rollout import EpisodeResult
 from sb3_ddiffpg.serialization.safetensors_tree import convert
@@ -47,6 +46,8 @@ class CommandResult:
     @property
     def success_interval(self) -> tuple[float, float]:
         """Its 95 % Wilson interval."""
+        from scipy.stats import binomtest  # slow to import
+
         interval = binomtest(self.n_successes, self.n_episodes).proportion_ci(method="wilson")
         return float(interval.low), float(interval.high)
 

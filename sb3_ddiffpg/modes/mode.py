@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-from scipy.stats import mannwhitneyu
 
 from sb3_ddiffpg.serialization.safetensors_tree import Count, check_array, convert
 
@@ -124,7 +123,11 @@ def outclassed(modes: Sequence[Mode], by_success: bool) -> set[int]:
 
     def is_worse(own: np.ndarray) -> bool:
         wins = np.sign(best[:, None] - own).mean() / 2 + 0.5 if len(own) else 0.5
-        return wins > OUTCLASSED and mannwhitneyu(best, own, alternative="greater", method="asymptotic").pvalue < CHANCE
+        if wins <= OUTCLASSED:
+            return False
+        from scipy.stats import mannwhitneyu  # slow to import, and seldom asked
+
+        return mannwhitneyu(best, own, alternative="greater", method="asymptotic").pvalue < CHANCE
 
     return {index for index, own in enumerate(scores) if is_worse(own)}
 
