@@ -1,7 +1,9 @@
 """
-This checkout beside others, in turns: processor time of an update (quick networks, ant's size) and of a vector step.
+This checkout beside others, in turns: processor time of an update (quick networks, ant's size), of a vector step without
+updates, and of one of the whole loop (point maze with modes, one update; ant without modes yet, four).
 
 ``python benchmarks/bench_versions.py OTHER_CHECKOUT ...`` prints the ratio of the medians of each to the first other one.
+``--settings '{n_diffusion_steps: null}'`` are of this checkout alone.
 """
 
 import argparse
@@ -12,6 +14,9 @@ import time
 import warnings
 from pathlib import Path
 from statistics import median
+from typing import Any
+
+import yaml
 
 MAZE = ["#######", "#g.r.g#", "#######"]
 # Flat settings of version 0.1, which every version takes
@@ -29,11 +34,25 @@ ANT = dict(
     exploration_n_steps=3,
     policy_kwargs={"net_arch": [256, 256]},
 )
-MEASURES = {"update, quick": (QUICK, 40), "update, ant": (ANT, 20), "vector step": (QUICK, 200)}
+ANT_LOOP = {**ANT, "learning_starts": 2560, "gradient_steps": 4}
+#: Settings, repeats, and the environments: an id, how many, further arguments
+POINTS: tuple[str, int, dict[str, Any]] = "PointMazeV1-v0", 16, {"maze_map": MAZE}
+ANTS: tuple[str, int, dict[str, Any]] = "AntMazeV1-v0", 256, {"integrator": "euler", "ends_on_fall": True}
+MEASURES = {
+    "update, quick": (QUICK, 40, POINTS),
+    "update, ant": (ANT, 20, POINTS),
+    "vector step": (QUICK, 200, POINTS),
+    "loop, point maze": (QUICK, 40, POINTS),
+    "loop, ant": (ANT_LOOP, 5, ANTS),
+}
 
 
-def serve() -> None:
-    """Answer each line of the input, the name of a measure, with seconds of processor time for one update or step."""
+def serve(changes: dict[str, Any]) -> None:
+    """
+    Answer each line of the input, the name of a measure, with seconds of processor time for one update or step.
+
+    :param changes: Settings beside those of the measures
+    """
     import torch as th
     from stable_baselines3.common.logger import Logger
 
@@ -42,11 +61,11 @@ def serve() -> None:
 
     th.set_num_threads(1)
     models = {}
-    for name, (settings, _) in MEASURES.items():
-        env = make_vec_env("PointMazeV1-v0", n_envs=16, seed=0, maze_map=MAZE)
+    for name, (settings, _, (env_id, n_envs, env_kwargs)) in MEASURES.items():
+        env = make_vec_env(env_id, n_envs=n_envs, seed=0, **env_kwargs)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            models[name] = DDiffPG("MlpPolicy", env, seed=0, device="cpu", **settings)
+            models[name] = DDiffPG("MlpPolicy", env, seed=0, device="cpu", **settings, **changes)
             models[name].learn(6_000)
         models[name].set_logger(Logger(None, []))
         models[name].learning_starts = 10**9 if name == "vector step" else 0
@@ -54,14 +73,15 @@ def serve() -> None:
     print("ready", flush=True)
     for line in sys.stdin:
         name = line.strip()
-        model, (_, repeats) = models[name], MEASURES[name]
+        model, (_, repeats, (_, n_envs, _)) = models[name], MEASURES[name]
         started = time.process_time()
-        if name == "vector step":
-            # Without updates and re-clusterings, whose cost is that of the modes that a version happens to have found
-            model.learning_starts, model.gradient_steps, model.recluster_freq = 0, 0, 10**9
-            model.learn(16 * repeats, reset_num_timesteps=False)
-        else:
+        if name.startswith("update"):
             model.train(repeats, model.batch_size)
+        else:
+            if name == "vector step":
+                # Without updates and re-clusterings, whose cost is that of the modes that a version happens to have found
+                model.learning_starts, model.gradient_steps, model.recluster_freq = 0, 0, 10**9
+            model.learn(n_envs * repeats, reset_num_timesteps=False)
         print((time.process_time() - started) / repeats, flush=True)
 
 
@@ -70,15 +90,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkouts", nargs="*", type=Path)
     parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--settings", type=yaml.safe_load, default={})
     parser.add_argument("--serve", action="store_true")
     given = parser.parse_args()
     if given.serve:
-        return serve()
+        return serve(given.settings)
     checkouts = [*given.checkouts, Path(__file__).parents[1]]
     workers = []
     for checkout in checkouts:
         environment = {**os.environ, "PYTHONPATH": str(checkout.resolve()), "OMP_NUM_THREADS": "1"}
-        command = [sys.executable, __file__, "--serve"]
+        own = ["--settings", yaml.safe_dump(given.settings)] if checkout == checkouts[-1] else []
+        command = [sys.executable, __file__, "--serve", *own]
         worker = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         while worker.stdout.readline().strip() != "ready":
             pass
