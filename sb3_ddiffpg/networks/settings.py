@@ -57,7 +57,8 @@ class TargetActionSettings(Settings):
 
     :param learning_rate: Step size eta of the ascent
     :param n_steps: Number of ascent steps K per update
-    :param optimizer: ``"adam"``, ``"normalized"`` or ``"sgd"`` (the paper's equation), see ``target_actions.ascend``
+    :param optimizer: ``"adam"``, ``"normalized"``, ``"relative"`` or ``"sgd"`` (the paper's equation), see
+        ``target_actions.ascend``
     """
 
     group = "target_action"

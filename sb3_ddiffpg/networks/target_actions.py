@@ -8,7 +8,7 @@ import torch as th
 
 # Actions stay inside the bounds by this much, so that a gradient can still pull them back
 ACTION_LIMIT = 1 - 1e-5
-ACTION_OPTIMIZERS = ("sgd", "normalized", "adam")
+ACTION_OPTIMIZERS = ("sgd", "normalized", "relative", "adam")
 
 
 def ascend(
@@ -19,13 +19,16 @@ def ascend(
     optimizer: str = "adam",
 ) -> th.Tensor:
     """
-    Improve every action on its own: the result for a row does not depend on the rest of the batch.
+    Improve every action on its own: but for ``"relative"``, the result for a row does not depend on the rest of the batch.
 
     ``"sgd"`` takes plain steps (the paper's equation), ``"normalized"`` steps of length ``learning_rate`` along the
     gradient, ``"adam"`` restarts Adam (Kingma & Ba, 2015) for every call, so that its first step is a sign step.
+    ``"relative"`` steps are those of ``"normalized"``, but shorter in proportion where the gradient is less than its group's
+    mean: where all actions are worth nearly the same, its direction is that of the critics' errors, and full steps would make
+    the policy sure of any action at all.
 
-    :param gradient: Maps actions to the gradient of their value, both [..., action_dim]
-    :param actions: Where to start, shape [..., action_dim]
+    :param gradient: Maps actions to the gradient of their value, both [..., n, action_dim]
+    :param actions: Where to start, shape [..., n, action_dim], the n rows of each group
     :param learning_rate: Step size eta
     :param n_steps: Number of steps K
     :param optimizer: One of ``ACTION_OPTIMIZERS``
@@ -34,8 +37,11 @@ def ascend(
     mean, square = th.zeros_like(actions), th.zeros_like(actions)
     for step in range(1, n_steps + 1):
         ascent = gradient(actions)
-        if optimizer == "normalized":
-            ascent = ascent / (ascent.norm(dim=-1, keepdim=True) + 1e-8)
+        if optimizer in ("normalized", "relative"):
+            sizes = ascent.norm(dim=-1, keepdim=True)
+            if optimizer == "relative":
+                sizes = sizes.maximum(sizes.mean(dim=-2, keepdim=True))
+            ascent = ascent / (sizes + 1e-8)
         elif optimizer == "adam":
             mean.lerp_(ascent, 0.1)
             square.lerp_(ascent.square(), 0.001)

@@ -154,7 +154,7 @@ def test_action_gradient_equals_finite_differences_and_ignores_the_batch(activat
     th.testing.assert_close(alone, gradient[:, :1])
 
 
-@pytest.mark.parametrize("optimizer", ["sgd", "normalized", "adam"])
+@pytest.mark.parametrize("optimizer", ["sgd", "normalized", "relative", "adam"])
 def test_ascent_climbs_to_the_maximum(optimizer):
     """Q(a) = -|a - a*|^2 has its maximum at a*; autograd gives the gradient."""
     best = th.tensor([[0.4, -0.7], [0.0, 0.9]])
@@ -176,6 +176,16 @@ def test_ascent_single_steps_by_hand():
     th.testing.assert_close(ascend(gradient, start, 0.1, 1, "normalized"), th.tensor([[0.06, -0.08]]))
     th.testing.assert_close(ascend(gradient, start, 0.1, 1, "adam"), th.tensor([[0.1, -0.1]]))
     assert ascend(gradient, start, 5.0, 3, "sgd").abs().max() == pytest.approx(ACTION_LIMIT)
+
+
+def test_relative_steps_by_hand():
+    """Two groups, whose gradients are 1 and 5 long, and 30 and 10: means of 3 and of 20."""
+    slopes = th.tensor([[[0.6, 0.8], [3.0, -4.0]], [[0.0, 30.0], [-10.0, 0.0]]])
+    expected = th.tensor([[[0.6 / 3, 0.8 / 3], [0.6, -0.8]], [[0.0, 1.0], [-0.5, 0.0]]])
+    found = ascend(lambda actions: slopes, th.zeros(2, 2, 2), 0.1, 1, "relative")
+    th.testing.assert_close(found, 0.1 * expected)
+    nowhere = ascend(th.zeros_like, th.full((1, 3, 2), 0.5), 0.1, 4, "relative")
+    assert th.equal(nowhere, th.full((1, 3, 2), 0.5))
 
 
 def test_ascent_adam_equals_torch():
