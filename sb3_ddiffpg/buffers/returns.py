@@ -89,7 +89,7 @@ def discounted_returns(rewards: np.ndarray, gamma: float, then: str = "ends") ->
         as count; or it ``"stays"`` at its goal, see ``group_returns``
     :return: From each step on, the last first, same shape
     """
-    from scipy.signal import lfilter  # as long to import as half of torch; who only acts needs none
+    from scipy.signal import lfilter  # slow to import, and who only acts needs none
 
     latest_first = np.array(rewards[::-1], dtype=np.float64)
     if gamma < 1 and then == "goes on":
