@@ -68,7 +68,10 @@ def serve(changes: dict[str, Any]) -> None:
             models[name] = DDiffPG("MlpPolicy", env, seed=0, device="cpu", **settings, **changes)
             models[name].learn(6_000)
         models[name].set_logger(Logger(None, []))
-        models[name].learning_starts = 10**9 if name == "vector step" else 0
+        models[name].learning_starts = 0
+        if name == "vector step":
+            # Without updates and re-clusterings, whose cost is that of the modes that a version happens to have found
+            models[name].gradient_steps, models[name].recluster_freq = 0, 10**9
     th.set_flush_denormal(True)
     print("ready", flush=True)
     for line in sys.stdin:
@@ -78,9 +81,6 @@ def serve(changes: dict[str, Any]) -> None:
         if name.startswith("update"):
             model.train(repeats, model.batch_size)
         else:
-            if name == "vector step":
-                # Without updates and re-clusterings, whose cost is that of the modes that a version happens to have found
-                model.learning_starts, model.gradient_steps, model.recluster_freq = 0, 0, 10**9
             model.learn(n_envs * repeats, reset_num_timesteps=False)
         print((time.process_time() - started) / repeats, flush=True)
 
@@ -95,12 +95,10 @@ def main() -> None:
     given = parser.parse_args()
     if given.serve:
         return serve(given.settings)
-    checkouts = [*given.checkouts, Path(__file__).parents[1]]
     workers = []
-    for checkout in checkouts:
+    for checkout, changes in [*((each, {}) for each in given.checkouts), (Path(__file__).parents[1], given.settings)]:
         environment = {**os.environ, "PYTHONPATH": str(checkout.resolve()), "OMP_NUM_THREADS": "1"}
-        own = ["--settings", yaml.safe_dump(given.settings)] if checkout == checkouts[-1] else []
-        command = [sys.executable, __file__, "--serve", *own]
+        command = [sys.executable, __file__, "--serve", "--settings", yaml.safe_dump(changes)]
         worker = subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         while worker.stdout.readline().strip() != "ready":
             pass
