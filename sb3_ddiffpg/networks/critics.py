@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import partial
 from itertools import pairwise
 
 import torch as th
@@ -42,6 +42,7 @@ class ModeCritics(nn.Module):
     lower: th.Tensor
     upper: th.Tensor
     atoms: th.Tensor
+    kinds: th.Tensor
 
     def __init__(
         self,
@@ -73,6 +74,7 @@ class ModeCritics(nn.Module):
         lower, upper = th.tensor([exploration_support, support], dtype=th.float32).T
         self.register_buffer("lower", lower, persistent=False)
         self.register_buffer("upper", upper, persistent=False)
+        self.register_buffer("kinds", self._kinds_of(n_groups), persistent=False)
         fractions = th.linspace(0, 1, n_atoms)
         self.register_buffer("atoms", lower[:, None] + fractions * (upper - lower)[:, None], persistent=False)
         for group in range(n_groups):
@@ -83,9 +85,10 @@ class ModeCritics(nn.Module):
         """Number of groups G: the exploratory one and the modes."""
         return self.weights[0].shape[0]
 
-    def _kind(self) -> th.Tensor:
+    @staticmethod
+    def _kinds_of(n_groups: int) -> th.Tensor:
         """Row of the support tables for every group, shape [G]."""
-        return _kinds(self.n_groups, self.atoms.device)
+        return th.arange(n_groups).clamp(max=1)
 
     @th.no_grad()
     def _reset_output(self, group: int, zero_weights: bool = True) -> None:
@@ -137,7 +140,7 @@ class ModeCritics(nn.Module):
         """
         if self.n_atoms == 1:
             return logits.squeeze(-1)
-        return (logits.softmax(dim=-1) * self.atoms[self._kind()[groups]][:, None, None, :]).sum(dim=-1)
+        return (logits.softmax(dim=-1) * self.atoms[self.kinds[groups]][:, None, None, :]).sum(dim=-1)
 
     def values_by(self, groups: slice, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -164,7 +167,7 @@ class ModeCritics(nn.Module):
         :return: Target probabilities, shape [G, n, n_atoms]; scalar targets, shape [G, n, 1], when ``n_atoms=1``
         """
         logits = self(features, actions)
-        kind = self._kind()
+        kind = self.kinds
         low, high = self.lower[kind][:, None], self.upper[kind][:, None]  # [G, 1]
         if self.n_atoms == 1:
             values = logits.squeeze(-1).amin(dim=1)  # [G, n]
@@ -204,7 +207,7 @@ class ModeCritics(nn.Module):
         """
         if self.n_atoms > 1:
             return targets[..., -1].mean(dim=1)
-        return (targets[..., 0] >= self.upper[self._kind()][:, None]).float().mean(dim=1)
+        return (targets[..., 0] >= self.upper[self.kinds][:, None]).float().mean(dim=1)
 
     def action_gradient(self, features: th.Tensor) -> Callable[[th.Tensor], th.Tensor]:
         """
@@ -226,7 +229,7 @@ class ModeCritics(nn.Module):
         *hidden, output = self._layers(actions, parameters)
         backward = th.ones_like(output)
         if self.n_atoms > 1:  # of the expected value with respect to the logits: p (z - E z)
-            probabilities, atoms = output.softmax(dim=-1), self.atoms[self._kind()][:, None, :]
+            probabilities, atoms = output.softmax(dim=-1), self.atoms[self.kinds][:, None, :]
             backward = probabilities * (atoms - (probabilities * atoms).sum(dim=-1, keepdim=True))
         for (weight, _), before in zip(parameters[:0:-1], hidden[::-1], strict=True):
             backward = self._through_activation(th.bmm(backward, weight.mT), before)
@@ -266,6 +269,7 @@ class ModeCritics(nn.Module):
             for layer, parameter in enumerate(parameters):
                 replaced[parameter] = nn.Parameter(parameter[source].clone())
                 parameters[layer] = replaced[parameter]
+        self.kinds = self._kinds_of(self.n_groups).to(self.atoms.device)
         if optimizer is not None:
             for param_group in optimizer.param_groups:
                 param_group["params"] = [replaced.get(parameter, parameter) for parameter in param_group["params"]]
@@ -322,11 +326,6 @@ class ModeCritics(nn.Module):
         for gradient in gradients:
             gradient.mul_(scale)
         return norms
-
-
-@cache
-def _kinds(n_groups: int, device: th.device) -> th.Tensor:
-    return th.arange(n_groups, device=device).clamp(max=1)
 
 
 def project_distribution(probabilities: th.Tensor, atoms: th.Tensor, rewards: th.Tensor, discounts: th.Tensor) -> th.Tensor:
