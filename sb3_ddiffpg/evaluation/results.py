@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from sb3_ddiffpg.evaluation import diversity
 from sb3_ddiffpg.evaluation.rollout import EpisodeResult
 from sb3_ddiffpg.serialization.safetensors_tree import convert
 
@@ -131,6 +132,47 @@ class ModeEvaluation:
         """Share of the listed routes that are robust; NaN if none is listed."""
         return len(set(self._robust()) & set(self.listed)) / len(self.listed) if self.listed else float("nan")
 
+    def _listed_counts(self) -> list[int]:
+        """Uncommanded successes by each listed route that was taken."""
+        return [count for label, count in self.uncommanded.labels.items() if label in self.listed]
+
+    @property
+    def behavior_entropy(self) -> float:
+        """D3IL's, of the uncommanded successes over the listed routes, in [0, 1]; NaN if fewer than two are listed."""
+        return diversity.behavior_entropy(self._listed_counts(), len(self.listed))
+
+    @property
+    def reachable_modes(self) -> float:
+        """DrAC's: listed routes that were taken at least once uncommanded; NaN if none is listed."""
+        return len(self._listed_counts()) if self.listed else float("nan")
+
+    @property
+    def multi_goal_score(self) -> float:
+        """DrAC's, of the uncommanded episodes, in [0, 1]; NaN if no route is listed."""
+        if not self.listed:
+            return float("nan")
+        return diversity.multi_goal_score(self._listed_counts(), len(self.listed), self.uncommanded.n_episodes)
+
+    def few_shot_robustness(self, n_removed: int, n_trials: int = 5) -> float:
+        """
+        Tell how likely a few uncommanded trials are to succeed if some listed routes are closed, as DrAC does with goals.
+
+        :param n_removed: Number of listed routes that are closed
+        :param n_trials: Number of trials
+        :return: The probability; NaN if no route is listed
+        :raises ValueError: If an argument is out of range
+        """
+        if not self.listed:
+            return float("nan")
+        if not 0 <= n_removed <= len(self.listed):
+            raise ValueError(
+                f"n_removed: {n_removed} given; accepted are 0 to {len(self.listed)}, the number of listed routes"
+            )
+        if n_trials < 1:
+            raise ValueError(f"n_trials: {n_trials} given; accepted are numbers from 1 up")
+        n_episodes = self.uncommanded.n_episodes
+        return diversity.few_shot_robustness(self._listed_counts(), len(self.listed), n_episodes, n_removed, n_trials)
+
     @property
     def commandable(self) -> list[str]:
         """Routes that some command takes in at least 95 % of its episodes."""
@@ -212,6 +254,10 @@ class ModeEvaluation:
             "robust_modes": self.robust_modes,
             "effective_modes": self.effective_modes,
             "coverage": _number(self.coverage),
+            "behavior_entropy": _number(self.behavior_entropy),
+            "reachable_modes": _number(self.reachable_modes),
+            "multi_goal_score": _number(self.multi_goal_score),
+            "few_shot_robustness": [_number(self.few_shot_robustness(k)) for k in range(len(self.listed) + 1)],
             "commanded_modes": self.commanded_modes,
             "control_accuracy": _number(self.control_accuracy),
             "commandable": self.commandable,

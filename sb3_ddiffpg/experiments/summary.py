@@ -29,6 +29,8 @@ MEASURES: dict[str, Callable[[ModeEvaluation], float]] = {
     "robust modes": lambda found: found.robust_modes,
     "commanded modes": lambda found: found.commanded_modes,
     "coverage": lambda found: found.coverage,
+    "behavior entropy": lambda found: found.behavior_entropy,
+    "multi-goal score": lambda found: found.multi_goal_score,
     "success": lambda found: found.uncommanded.success_rate if found.success_told else float("nan"),
     "return": lambda found: found.uncommanded.mean_return,
     "length": lambda found: found.uncommanded.mean_length,
@@ -105,7 +107,7 @@ def elsewhere_table(runs: Sequence[Recorded]) -> pd.DataFrame:
 
 
 def _digits(measure: str) -> int:
-    return {"success": 2, "coverage": 2}.get(measure, 1)
+    return {"success": 2, "coverage": 2, "behavior entropy": 2, "multi-goal score": 2}.get(measure, 1)
 
 
 def _paper_cells(task: str, run: Recorded) -> dict[str, str | None]:
