@@ -10,7 +10,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_ddiffpg.envs.vec_env.grouped import NOBODY, GroupedVecEnv, answer_of, check_groups, first_of_groups, make_group
+from sb3_ddiffpg.envs.vec_env.group import NOBODY, EnvGroup, answer_of
+from sb3_ddiffpg.envs.vec_env.grouped import GroupedVecEnv, check_groups, first_of_groups
 
 # Losses of one group in a row, without an answer between them, after which there is no further one
 MOST_LOSSES = 3
@@ -29,7 +30,7 @@ class _Group:
     def answer(self, command: str, argument: Any) -> tuple[str, Any]:
         try:
             if command == "make":
-                self.envs = make_group(argument, self.turn)
+                self.envs = EnvGroup(argument, self.turn)
                 return "ok", (self.envs.observation_space, self.envs.action_space, self.envs.render_mode)
             return "ok", answer_of(self.envs, command, argument)
         except Exception as error:
