@@ -4,7 +4,9 @@ imported here: with them a worker would take seconds to begin, and most of its m
 """
 
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -188,6 +190,32 @@ def answer_of(envs: Any, command: str, argument: Any) -> Any:
     for env_idx in indices:
         answers.append((getattr(envs, name)(*arguments, **keywords, indices=[env_idx]) or [None])[0])
     return answers
+
+
+class Actor:
+    """
+    What a Ray cluster runs for ``RayVecEnv``: a group of environments on some machine. It answers ``("ok", result)`` or
+    ``("error", (environment, lacks, text))``, where ``lacks`` says whether it was an AttributeError. So an exception that
+    arrives is always one of Ray's.
+    """
+
+    def __init__(self) -> None:
+        self.envs: Any = None
+        self.turn = SimpleNamespace(value=NOBODY)
+
+    def answer(self, command: str, argument: Any) -> tuple[str, Any]:
+        """
+        :param command: what it is to do
+        :param argument: of the command
+        :return: the answer
+        """
+        try:
+            if command == "make":
+                self.envs = EnvGroup(argument, self.turn)
+                return "ok", (self.envs.observation_space, self.envs.action_space, self.envs.render_mode)
+            return "ok", answer_of(self.envs, command, argument)
+        except Exception as error:
+            return "error", (self.turn.value, isinstance(error, AttributeError), traceback.format_exc())
 
 
 def _gymnasium_env(env: Any) -> gym.Env:
