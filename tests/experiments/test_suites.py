@@ -14,9 +14,9 @@ from filelock import FileLock
 
 from sb3_ddiffpg.experiments import __main__ as cli
 from sb3_ddiffpg.experiments import execution
-from sb3_ddiffpg.experiments.execution import LocalExecutor, TrialFailed, command_of
+from sb3_ddiffpg.experiments.execution import LocalExecutor, TrialFailed
 from sb3_ddiffpg.experiments.progress import Progress, read_progress, write_progress
-from sb3_ddiffpg.experiments.record import is_complete, recorded_trial
+from sb3_ddiffpg.experiments.record import is_complete, new_record, recorded_trial
 from sb3_ddiffpg.experiments.run import missing_trials, run_suite
 from sb3_ddiffpg.experiments.suite import Resources, read_suite, suite_names
 from sb3_ddiffpg.experiments.trial import setting_of
@@ -300,11 +300,17 @@ def test_what_lost_its_evaluation_is_not_complete(tmp_path):
 
 def test_what_fails_is_named_and_the_others_go_on(tiny, tmp_path, monkeypatch, capsys):
     """After all attempts."""
-    real = command_of
+    # What a training leaves, without its training
+    finished = (
+        "import os, sys; os.chdir(sys.argv[1]); "
+        "open('config.yml', 'w').write(sys.argv[2]); open('evaluation.json', 'w').close()"
+    )
 
     def broken(trial, folder):
-        command = real(trial, folder)
-        return command if trial.algo == "ddiffpg" else [sys.executable, "-c", "print('once'); raise SystemExit(3)"]
+        if trial.algo != "ddiffpg":
+            return [sys.executable, "-c", "print('once'); raise SystemExit(3)"]
+        record = yaml.safe_dump({**new_record(trial, folder), "result": {"complete": True}})
+        return [sys.executable, "-c", finished, str(folder), record]
 
     monkeypatch.setattr(execution, "command_of", broken)
     with pytest.raises(SystemExit, match="1 trials failed: PointMazeV1-v0/td3_c51, wide/seed0"):
@@ -344,7 +350,8 @@ def test_a_runner_that_is_killed_leaves_no_process(tiny, tmp_path, start):
 
 def test_a_suite_that_is_killed_goes_on_and_repeats_nothing(tiny, tmp_path, start, capsys):
     """The runner and what it runs, all by SIGKILL, when one of two trials is complete."""
-    tiny.write_text(TINY.replace("n_timesteps: 800", "n_timesteps: 2400"))
+    text = TINY.replace("n_timesteps: 800", "n_timesteps: 2400")
+    tiny.write_text(text.replace("settings: {policy_kwargs", "settings: {n_timesteps: 800, policy_kwargs"))
     out = tmp_path / "out"
     arguments = ["run", str(tiny), "--out", str(out), "--workers", "1", "--no-report"]
     process = start([sys.executable, "-m", "sb3_ddiffpg.experiments", *arguments])
