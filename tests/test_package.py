@@ -105,18 +105,32 @@ def test_configuration_comes_from_the_installed_package(installed):
 
 def test_import_is_cheap(installed):
     heavy = "mujoco", "pybullet", "gymnasium_robotics", "matplotlib", "rl_zoo3", "ray", "scipy.signal", "scipy.stats"
-    code = f"import sys, sb3_ddiffpg, sb3_ddiffpg.envs; print([name for name in {heavy} if name in sys.modules])"
-    assert run_installed(installed, code) == "[]"
+    for code, names in (
+        ("import sb3_ddiffpg, sb3_ddiffpg.envs", (*heavy, "torch", "stable_baselines3", "scipy", "numba")),
+        ("from sb3_ddiffpg import *; from sb3_ddiffpg.envs import *", heavy),
+    ):
+        code = f"import sys; {code}; print([name for name in {names} if name in sys.modules])"
+        assert run_installed(installed, code) == "[]"
 
 
-# Imports a module as if nothing else were installed than what these extras ask for
+def test_what_is_imported_when_it_is_asked_for():
+    import sb3_ddiffpg
+
+    assert sb3_ddiffpg.DDiffPG is sb3_ddiffpg.ddiffpg.DDiffPG and set(sb3_ddiffpg.__all__) <= set(dir(sb3_ddiffpg))
+    with pytest.raises(AttributeError, match="module 'sb3_ddiffpg' has no attribute 'DDiffGP'"):
+        _ = sb3_ddiffpg.DDiffGP
+    with pytest.raises(ImportError, match="cannot import name 'WorkVecEnv' from 'sb3_ddiffpg.envs.vec_env'"):
+        from sb3_ddiffpg.envs.vec_env import WorkVecEnv  # noqa: F401
+
+
+# Imports modules, with all that they offer, as if nothing else were installed than what these extras ask for
 WITHOUT_OTHERS = """
 import importlib, sys
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-wanted, module = sys.argv[1].split(","), sys.argv[2]
+wanted, modules = sys.argv[1].split(","), sys.argv[2:]
 known, waiting = set(), [("sb3_ddiffpg", extra) for extra in ["", *wanted]]
 while waiting:
     name, extra = waiting.pop()
@@ -145,27 +159,25 @@ class Absent:
 sys.meta_path.insert(0, Absent())
 for name in [name for name in sys.modules if name.split(".")[0] in others]:
     del sys.modules[name]
-importlib.import_module(module)
+for module in map(importlib.import_module, modules):
+    for name in getattr(module, "__all__", ()):
+        getattr(module, name)
 """
 
 
 @pytest.mark.parametrize(
-    ("extras", "module"),
+    ("extras", "modules"),
     [
-        ("", "sb3_ddiffpg"),
-        ("", "sb3_ddiffpg.callbacks.checkpoint"),
-        ("zoo", "sb3_ddiffpg.zoo"),
-        ("plots", "sb3_ddiffpg.visualization.plots"),
-        ("plots", "sb3_ddiffpg.report"),
-        ("zoo,plots", "sb3_ddiffpg.experiments.training"),
-        ("zoo,plots", "sb3_ddiffpg.experiments.run"),
-        ("zoo,plots", "sb3_ddiffpg.experiments.report"),
-        ("zoo,plots,hub", "sb3_ddiffpg.experiments.card"),
+        ("", ["sb3_ddiffpg", "sb3_ddiffpg.callbacks.checkpoint"]),
+        ("zoo", ["sb3_ddiffpg.zoo"]),
+        ("plots", ["sb3_ddiffpg.visualization.plots", "sb3_ddiffpg.report"]),
+        ("zoo,plots", [f"sb3_ddiffpg.experiments.{name}" for name in ("training", "run", "report")]),
+        ("zoo,plots,hub", ["sb3_ddiffpg.experiments.card"]),
     ],
 )
-def test_extras_are_enough(extras, module):
+def test_extras_are_enough(extras, modules):
     """What tests and other extras bring along must not hide what is missing."""
-    done = subprocess.run([sys.executable, "-c", WITHOUT_OTHERS, extras, module], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", WITHOUT_OTHERS, extras, *modules], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 

@@ -1,5 +1,6 @@
 """Multi-step returns of the transitions of all groups: what of a window counts, and what ends it."""
 
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -89,11 +90,10 @@ def discounted_returns(rewards: np.ndarray, gamma: float, then: str = "ends") ->
         as count; or it ``"stays"`` at its goal, see ``group_returns``
     :return: From each step on, the last first, same shape
     """
-    from scipy.signal import lfilter  # slow to import, and who only acts needs none
-
     latest_first = np.array(rewards[::-1], dtype=np.float64)
     if gamma < 1 and then == "goes on":
         latest_first[0] += gamma / (1 - gamma) * latest_first[: round(1 / (1 - gamma))].mean()
     elif gamma < 1 and then == "stays" and latest_first[0] > 0:
         latest_first[0] /= 1 - gamma
-    return lfilter([1.0], [1.0, -gamma], latest_first)
+    # As ``scipy.signal.lfilter``, which takes longer to import than this ever takes
+    return np.fromiter(accumulate(latest_first.tolist(), lambda after, reward: reward + gamma * after), np.float64)

@@ -1,6 +1,5 @@
 """Declared mode features under wrappers of Gymnasium: where they are in what the wrappers make of the observation."""
 
-from abc import ABC
 from collections.abc import Callable
 from typing import Any
 
@@ -9,15 +8,8 @@ import numpy as np
 from gymnasium import spaces, wrappers
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_ddiffpg.utils.changing_wrappers import CHANGES, SAME_COMPONENTS, ChangesComponents
 from sb3_ddiffpg.utils.vec_envs import env_attribute, is_wrapped
-
-#: Of these the observation is that of the environment within, component by component: later, scaled, or of another type
-SAME_COMPONENTS = (
-    *(wrappers.NormalizeObservation, wrappers.RescaleObservation, wrappers.DtypeObservation, wrappers.ReshapeObservation),
-    wrappers.DelayObservation,
-)
-#: Made to change observations
-CHANGES = gym.ObservationWrapper, wrappers.FrameStackObservation, wrappers.MaxAndSkipObservation
 
 
 class _LostError(ValueError):
@@ -121,18 +113,6 @@ _RULES: dict[Any, Callable[[Any, Any, Any, Any], Any]] = {
     wrappers.TimeAwareObservation: _with_time,
     (wrappers.FilterObservation, wrappers.AddRenderObservation): _filtered,
 }
-
-
-class ChangesComponents(ABC):  # noqa: B024
-    """The wrappers, by their classes, behind which an index of an observation may mean something else."""
-
-    @classmethod
-    def __subclasshook__(cls, kind: type) -> bool:
-        """
-        :param kind: Of a wrapper
-        :return: Whether it is one
-        """
-        return issubclass(kind, CHANGES) and not issubclass(kind, SAME_COMPONENTS)
 
 
 def _of_a_worker(declared: Any, env: VecEnv) -> Any:

@@ -6,20 +6,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
-from stable_baselines3.common.env_util import make_vec_env as make_sb3_vec_env
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_ddiffpg.envs.mazes.homotopy import HomotopyTracker
 from sb3_ddiffpg.envs.mazes.maze import LISTED_ROUTES, MAZES, Maze, reduce_word
-from sb3_ddiffpg.envs.mazes.point import PointMazeEnv, PointMazeVecEnv
-from sb3_ddiffpg.envs.vec_env.ray_actors import RayVecEnv
-from sb3_ddiffpg.envs.vec_env.tracing import TracingDummyVecEnv
-from sb3_ddiffpg.envs.vec_env.workers import WorkerVecEnv
 from sb3_ddiffpg.envs.wrappers import HideGoal
+from sb3_ddiffpg.utils.lazy import Lazy
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+    from sb3_ddiffpg.envs.mazes.point import PointMazeEnv, PointMazeVecEnv
 
 __all__ = [
     "LISTED_ROUTES",
@@ -36,6 +36,15 @@ __all__ = [
     "registered_id",
     "registered_spec",
 ]
+
+_lazy = Lazy(
+    __name__, dict.fromkeys(("PointMazeEnv", "PointMazeVecEnv"), "mazes.point"), ("description", "snapshots", "vec_env")
+)
+
+
+def __getattr__(name: str) -> Any:
+    return _lazy(name)
+
 
 # Single environment -> the class that steps many of them together. Strings, so that simulators are imported when needed
 _VEC_ENVS = {
@@ -121,14 +130,14 @@ def make_vec_env(
     monitor_dir: str | None = None,
     wrapper_class: Callable[..., gym.Env] | None = None,
     env_kwargs: dict[str, Any] | None = None,
-    vec_env_cls: Callable[..., VecEnv] | str | None = None,
+    vec_env_cls: "Callable[..., VecEnv] | str | None" = None,
     vec_env_kwargs: dict[str, Any] | None = None,
     monitor_kwargs: dict[str, Any] | None = None,
     wrapper_kwargs: dict[str, Any] | None = None,
     *,
     n_threads: int | None = None,
     **more_env_kwargs: Any,
-) -> VecEnv:
+) -> "VecEnv":
     """
     Many environments as SB3 wants them: in one process, with ``info["episode"]`` at the end of each episode. Takes what SB3's
     ``make_vec_env`` takes.
@@ -156,6 +165,12 @@ def make_vec_env(
     :raises ValueError: if ``n_envs`` is less than 1, an argument of the environment is given twice, or ``vec_env_cls`` is no
         class and another word
     """
+    # Only now: a worker imports this module too, and needs none of them
+    from stable_baselines3.common.env_util import make_vec_env as make_sb3_vec_env
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    from sb3_ddiffpg.envs.vec_env import RayVecEnv, TracingDummyVecEnv
+
     if n_envs < 1:
         raise ValueError(f"n_envs: {n_envs} given; accepted are whole numbers from 1 up")
     if twice := sorted(set(env_kwargs or {}) & set(more_env_kwargs)):
@@ -191,13 +206,15 @@ def make_vec_env(
     return VecMonitor(env, None if monitor_dir is None else os.path.join(monitor_dir, str(start_index)))
 
 
-def _arms(spec: EnvSpec, n_envs: int, n_workers: int | None, kwargs: dict[str, Any]) -> VecEnv:
+def _arms(spec: EnvSpec, n_envs: int, n_workers: int | None, kwargs: dict[str, Any]) -> "VecEnv":
+    from sb3_ddiffpg.envs.vec_env import TracingDummyVecEnv, WorkerVecEnv
+
     # The spec, not the id: the workers do not know what was registered here
     makers: list[Any] = [partial(gym.make, spec, **kwargs)] * n_envs
     return WorkerVecEnv(makers, n_workers) if n_envs > 1 else TracingDummyVecEnv(makers)
 
 
-def _mazes(spec: EnvSpec, n_envs: int, n_threads: int | None, kwargs: dict[str, Any]) -> VecEnv:
+def _mazes(spec: EnvSpec, n_envs: int, n_threads: int | None, kwargs: dict[str, Any]) -> "VecEnv":
     limit = kwargs.pop("max_episode_steps", None) or spec.max_episode_steps
     kwargs = {"render_mode": "rgb_array", **spec.kwargs, **kwargs}
     threads = {} if n_threads is None or spec.entry_point == _POINT_MAZE else {"n_threads": n_threads}

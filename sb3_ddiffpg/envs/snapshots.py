@@ -2,11 +2,8 @@
 
 from typing import Any
 
-import gymnasium as gym
 import msgspec
 import numpy as np
-from gymnasium import wrappers
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -18,38 +15,17 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
+from sb3_ddiffpg.envs.env_snapshots import Known, Snapshot, env_snapshot, match, peel, restore_env
 from sb3_ddiffpg.serialization.safetensors_tree import Count, check_array, convert
 from sb3_ddiffpg.utils.divergence import LARGEST
 
-
-def _plain(kind: type) -> type:
-    """The RL zoo puts a time limit of its own, which remembers the same, in the place of gymnasium's."""
-    return kind.__mro__[1] if kind.__module__ == "rl_zoo3.gym_patches" else kind
-
-
-# What each known wrapper remembers of an episode, and of which type it is; another kind could remember anything
-_GYM_WRAPPERS: dict[type, dict[str, Any]] = {
-    _plain(wrappers.TimeLimit): {"_elapsed_steps": Count | None},
-    wrappers.OrderEnforcing: {"_has_reset": bool},
-    wrappers.PassiveEnvChecker: {},
-    Monitor: {"rewards": list[float], "needs_reset": bool},
-}
-_VEC_WRAPPERS: dict[type, dict[str, Any]] = {
+# What each known wrapper remembers, and of which type it is; another kind could remember anything
+_VEC_WRAPPERS: Known = {
     VecMonitor: {"episode_returns": np.ndarray, "episode_lengths": np.ndarray, "episode_count": Count},
     VecNormalize: {"returns": np.ndarray},
     VecTransposeImage: {},
     VecCheckNan: {},
 }
-
-
-class _Layer(msgspec.Struct, forbid_unknown_fields=True):
-    kind: str
-    values: dict[str, Any]
-
-
-class _Snapshot(msgspec.Struct, forbid_unknown_fields=True):
-    layers: list[_Layer]
-    core: Any
 
 
 class _Moments(msgspec.Struct, forbid_unknown_fields=True):
@@ -63,46 +39,12 @@ class _Normalization(msgspec.Struct, forbid_unknown_fields=True):
     returns: _Moments
 
 
-def env_snapshot(env: gym.Env) -> dict[str, Any] | None:
-    """
-    :param env: An environment that says with ``state_dict()`` where its episode is; perhaps in wrappers of gymnasium and SB3
-    :return: What ``restore_env`` takes; None if it cannot be told
-    """
-    peeled = _peel(env, gym.Wrapper, "env", _GYM_WRAPPERS)
-    if peeled is None or not hasattr(peeled[1], "state_dict"):
-        return None
-    layers, core = peeled
-    return {"layers": layers, "core": core.state_dict()}
-
-
-def restore_env(env: gym.Env, tree: Any) -> None:
-    """
-    :param env: Made as the one that was asked
-    :param tree: What ``env_snapshot`` gave
-    :raises ValueError: If it is of another environment
-    """
-    snapshot = convert(tree, _Snapshot, "environment")
-    layers, core = _match(env, snapshot, "env", _GYM_WRAPPERS, "environment")
-    if isinstance(core, gym.Wrapper) or not hasattr(core, "load_state_dict"):
-        raise ValueError(f"environment: saved of another than {type(core).__name__}")
-    for wrapper, values in layers:
-        for name, value in values.items():
-            numbers = check_array(value, np.float64, [None], name).tolist() if isinstance(value, np.ndarray) else value
-            setattr(wrapper, name, convert(numbers, _GYM_WRAPPERS[_plain(type(wrapper))][name], f"environment.{name}"))
-        if isinstance(wrapper, wrappers.PassiveEnvChecker):  # it checks first calls, which others were
-            wrapper.checked_reset = wrapper.checked_step = wrapper.checked_data_reuse = True
-    try:
-        core.load_state_dict(snapshot.core)
-    except (LookupError, TypeError, AttributeError) as error:  # somebody's own may trust what it is given
-        raise ValueError(f"environment: {type(core).__name__} cannot be there: {error!r}") from error
-
-
 def vec_env_snapshot(env: VecEnv) -> dict[str, Any] | None:
     """
     :param env: Vectorised environments
     :return: What ``restore_vec_env`` takes; None if it cannot be told
     """
-    peeled = _peel(env, VecEnvWrapper, "venv", _VEC_WRAPPERS)
+    peeled = peel(env, VecEnvWrapper, "venv", _VEC_WRAPPERS)
     if peeled is None:
         return None
     layers, inner = peeled
@@ -130,8 +72,8 @@ def restore_vec_env(env: VecEnv, tree: Any) -> None:
     :param tree: What ``vec_env_snapshot`` gave
     :raises ValueError: If it is of another
     """
-    snapshot = convert(tree, _Snapshot, "environments")
-    layers, core = _match(env, snapshot, "venv", _VEC_WRAPPERS, "environments")
+    snapshot = convert(tree, Snapshot, "environments")
+    layers, core = match(env, snapshot, "venv", _VEC_WRAPPERS, "environments")
     for wrapper, values in layers:
         for name, value in values.items():
             before, found = getattr(wrapper, name), convert(value, _VEC_WRAPPERS[type(wrapper)][name], f"environments.{name}")
@@ -151,35 +93,6 @@ def restore_vec_env(env: VecEnv, tree: Any) -> None:
     # What a new one is made with waits for its first reset, which this one has had
     core._reset_seeds()
     core._reset_options()
-
-
-def _peel(env: Any, wrapper: type, inner: str, known: dict[type, dict[str, Any]]) -> tuple[list[dict[str, Any]], Any] | None:
-    """What each wrapper remembers, from the outermost on, and what is within; None if one is not known."""
-    layers = []
-    while isinstance(env, wrapper):
-        kind = _plain(type(env))
-        if kind not in known:
-            return None
-        values = {name: getattr(env, name) for name in known[kind]}
-        # A file holds many numbers only as arrays
-        values = {name: np.array(each, dtype=np.float64) if isinstance(each, list) else each for name, each in values.items()}
-        layers.append({"kind": kind.__name__, "values": values})
-        env = getattr(env, inner)
-    return layers, env
-
-
-def _match(
-    env: Any, snapshot: _Snapshot, inner: str, known: dict[type, dict[str, Any]], what: str
-) -> tuple[list[tuple[Any, dict[str, Any]]], Any]:
-    """Each wrapper with what one of its kind remembered, and what is within."""
-    layers = []
-    for layer in snapshot.layers:
-        kind = _plain(type(env))
-        if kind not in known or kind.__name__ != layer.kind or set(layer.values) != set(known[kind]):
-            raise ValueError(f"{what}: saved with a {layer.kind[:50]} where there is a {kind.__name__}")
-        layers.append((env, layer.values))
-        env = getattr(env, inner)
-    return layers, env
 
 
 def normalization(env: VecNormalize) -> dict[str, Any]:

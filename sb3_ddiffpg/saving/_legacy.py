@@ -6,8 +6,6 @@ import warnings
 from types import ModuleType
 from typing import Any
 
-from sb3_ddiffpg.modes.mode import modes_state
-
 #: Module of 0.1 -> modules that hold now what it held
 MODULES: dict[str, tuple[str, ...]] = {
     "actor_critic": ("common.actor_critic",),
@@ -150,6 +148,8 @@ def parts_of_0_1(attributes: dict[str, Any]) -> dict[str, Any] | None:
     """
     if "visits" not in attributes:
         return None
+    from sb3_ddiffpg.modes.mode import modes_state  # with PyTorch, which workers do not need
+
     attributes.pop("_behavior", None)
     for name in ("resolved_features", "novelty_cell_size"):
         attributes[name] = attributes.pop(f"_{name}", None)

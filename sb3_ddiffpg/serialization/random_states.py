@@ -5,7 +5,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import torch as th
 
 from sb3_ddiffpg.serialization.safetensors_tree import check_array, convert
 
@@ -22,6 +21,8 @@ def global_rng() -> dict[str, Any]:
     """
     :return: The global random states of Python, NumPy and PyTorch
     """
+    import torch as th  # only here: workers restore generators alone
+
     version, numbers, gauss = random.getstate()
     name, key, *rest = np.random.get_state(legacy=True)
     assert name == "MT19937"
@@ -40,6 +41,8 @@ def restore_global_rng(tree: Any) -> None:
     :param tree: What ``global_rng`` gave, on a machine with as many accelerators
     :raises ValueError: If it is something else
     """
+    import torch as th
+
     state = convert(tree, _Global, "random states")
     check_array(state.numpy_key, np.uint32, [624], "random states.numpy")
     check_array(state.torch, np.uint8, [len(th.get_rng_state())], "random states.torch")

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +15,6 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-import torch as th
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
@@ -184,7 +184,8 @@ def _pack(tree: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
         return tree
     if isinstance(tree, np.generic):
         return tree.item()
-    if isinstance(tree, th.Tensor):
+    torch = sys.modules.get("torch")  # where it was not imported, there is no tensor
+    if torch is not None and isinstance(tree, torch.Tensor):
         tree = tree.detach().cpu().numpy()
     if isinstance(tree, np.ndarray):
         if tree.dtype.kind not in "biuf" or not tree.dtype.isnative:

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from environments import small_model
-from gymnasium import spaces
+from goal_envs import NEAR, AnyGoal, NoGoals, OneAtATime, wrapped
 from planar import belongings, same
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import Logger
@@ -18,46 +18,7 @@ from sb3_ddiffpg.baselines import TD3C51
 from sb3_ddiffpg.buffers.hindsight import Hindsight
 from sb3_ddiffpg.envs.vec_env import WorkerVecEnv
 
-NEAR, GAMMA = 0.5, 0.9
-
-
-class AnyGoal(gym.Env):
-    """
-    A point in the plane, and a place to go to.
-
-    :param fixed: Whether it is always the same, but for a sensor's noise
-    :param extra: What the reward has beside that of the goal
-    :param dense: Whether it is the distance
-    :param latches: Whether the episode ends there
-    """
-
-    def __init__(self, fixed=False, extra=0.0, dense=False, latches=False, limit=20):
-        place = spaces.Box(-5.0, 5.0, (2,), np.float32)
-        self.observation_space = spaces.Dict(observation=place, achieved_goal=place, desired_goal=place)
-        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.fixed, self.extra, self.dense, self.latches, self.limit = fixed, extra, dense, latches, limit
-
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        distance = np.linalg.norm(achieved_goal - desired_goal, axis=-1)
-        return -distance if self.dense else -(distance > NEAR).astype(np.float32)
-
-    def _observation(self):
-        here = self.position.astype(np.float32)
-        return {"observation": here, "achieved_goal": here, "desired_goal": self.goal.astype(np.float32)}
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.position, self.steps = self.np_random.uniform(-0.1, 0.1, 2), 0
-        self.goal = 2.0 + self.np_random.normal(0, 1e-4, 2) if self.fixed else self.np_random.uniform(-3, 3, 2)
-        return self._observation(), {}
-
-    def step(self, action):
-        self.position = np.clip(self.position + 0.4 * action, -5, 5)
-        self.steps += 1
-        observation = self._observation()
-        reward = float(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})) + self.extra
-        reached = bool(np.linalg.norm(self.position - self.goal) <= NEAR)
-        return observation, reward, reached and self.latches, self.steps >= self.limit, {"is_success": reached}
+GAMMA = 0.9
 
 
 class NeverTold(gym.Wrapper):
@@ -203,24 +164,6 @@ def test_where_goals_cannot_be_others(kwargs):
     assert len(told) == ("extra" in kwargs)
 
 
-class NoGoals(gym.ObservationWrapper):
-    """The observation alone."""
-
-    def __init__(self, env):
-        super().__init__(env)
-        self.observation_space = env.observation_space["observation"]
-
-    def observation(self, observation):
-        return observation["observation"]
-
-
-class OneAtATime(gym.Wrapper):
-    """Its reward is computed of one goal."""
-
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        return float(achieved_goal @ desired_goal)
-
-
 @pytest.mark.parametrize("wrapper", [NoGoals, OneAtATime])
 def test_environments_without_goals_that_could_be_others(wrapper):
     env = DummyVecEnv([lambda: wrapper(AnyGoal())])
@@ -278,19 +221,15 @@ def test_a_mode_begins_before_any_success():
     assert same(critics, belongings(model)[mode.name])
 
 
-@pytest.mark.parametrize("kind", [WorkerVecEnv, SubprocVecEnv])
+@pytest.mark.parametrize("kind", [WorkerVecEnv, partial(SubprocVecEnv, start_method="fork")], ids=["workers", "processes"])
 def test_worker_processes(kind):
     """They answer; one that died of the question says why."""
     for wrapper, expected in ((lambda env: env, True), (NoGoals, False)):
-        env = kind([partial(_wrapped, wrapper)] * 2)
+        env = kind([partial(wrapped, wrapper)] * 2)
         assert (Hindsight.of(env) is not None) == expected
         env.close()
     with pytest.raises(ValueError, match="compute_reward of the environment must take arrays of goals"):
-        Hindsight.of(kind([partial(_wrapped, OneAtATime)] * 2))
-
-
-def _wrapped(wrapper):
-    return wrapper(AnyGoal())
+        Hindsight.of(kind([partial(wrapped, OneAtATime)] * 2))
 
 
 @pytest.mark.parametrize("fixed", [False, True])

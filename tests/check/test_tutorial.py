@@ -17,7 +17,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "your_own_environment.md"
 COMMANDS = {"ddiffpg check": command.main, "python -m sb3_ddiffpg.report": report.main}
 # Few steps, in a room whose exit random actions reach in one episode of eight: enough for a first mode
 FEW = {
-    "30_000, 20": "8_000, 4",
+    "30_000, 20": "4_800, 4",
     "--episodes 20": "--episodes 2",
     "else -120": "else -40",
     "else 120": "else 40",
@@ -64,7 +64,7 @@ def test_all_blocks_run(reader, capsys):
     assert "room:Room-v0 can be trained on" in out and "Replanner" in out
     assert (reader / "room.html").stat().st_size > 10_000
     assert set(names["again"].modes.names) >= set(names["model"].modes.names) and names["model"].modes
-    assert names["again"].num_timesteps == 8_800
+    assert names["again"].num_timesteps == 5_280
 
 
 def test_the_page_shows_what_is_printed(reader, capsys):

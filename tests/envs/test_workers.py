@@ -11,8 +11,9 @@ import time
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import AnySpaces, Fragile, TwoEnds, image_dict_space, small_model
-from stable_baselines3.common.vec_env import DummyVecEnv
+from environments import AnySpaces, Fragile, HangsAt, TellsModules, TwoEnds, image_dict_space, small_model
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from sb3_ddiffpg.envs import make_vec_env
 from sb3_ddiffpg.envs.vec_env.workers import WorkerVecEnv, _end
@@ -66,6 +67,23 @@ def test_attributes_and_methods(fragile):
     assert fragile.get_images() == [None] * 5
 
 
+@pytest.mark.parametrize("task", ["CartPole-v1", "FrankaReach-v0"])
+def test_a_worker_does_without_pytorch(task):
+    """With it each would take seconds to begin, and hundreds of megabytes; training asks for nothing that needs it."""
+    if task.startswith("Franka"):
+        pytest.importorskip("pybullet")
+    spec = gym.spec(task)
+    env = VecMonitor(WorkerVecEnv([lambda: TellsModules(gym.make(spec))] * 2, n_workers=1))
+    if task.startswith("Franka"):
+        small_model(env, learning_starts=4).learn(8)
+    else:
+        env.reset()
+    assert env.env_is_wrapped(Monitor) == [False] * 2 and env.env_is_wrapped(gym.wrappers.OrderEnforcing) == [True] * 2
+    assert env.env_method("has", "gymnasium", indices=[0]) == [True]
+    assert [env.env_method("has", name, indices=[0]) for name in ("torch", "stable_baselines3")] == [[False]] * 2
+    env.close()
+
+
 def test_an_error_names_its_environment(fragile):
     actions = np.zeros((5, 1), dtype=np.float32)
     fragile.step(actions)
@@ -110,31 +128,6 @@ def test_a_dead_worker_is_reported_and_does_not_hang(fragile, cause):
         with pytest.raises(RuntimeError, match=r"with environments 0 to 1 has died \(exit code 3\)"):
             fragile.env_method("die", indices=[0])
     assert time.perf_counter() - started < 20 and not any(process.is_alive() for process in fragile.processes)
-
-
-class HangsAt(TwoEnds):
-    """Never comes back from the given call."""
-
-    def __init__(self, call=None):
-        super().__init__()
-        self.call = call
-        self._wait("make")
-
-    def _wait(self, call):
-        if call == self.call:
-            time.sleep(1000)
-
-    def reset(self, **kwargs):
-        self._wait("reset")
-        return super().reset(**kwargs)
-
-    def step(self, action):
-        self._wait("step")
-        return super().step(action)
-
-    def state_dict(self):
-        self._wait("state_dict")
-        return {}
 
 
 @pytest.mark.parametrize("call", [pytest.param("make", marks=pytest.mark.slow), "reset", "step", "state_dict"])
@@ -206,7 +199,7 @@ def test_a_script_without_guard_is_told(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "import gymnasium\nfrom sb3_ddiffpg.envs.workers import WorkerVecEnv\n"
-        "WorkerVecEnv([lambda: gymnasium.make('CartPole-v1')] * 2)\n"
+        "WorkerVecEnv([lambda: gymnasium.make('CartPole-v1')] * 2, n_workers=1)\n"
     )
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
     assert done.returncode == 1 and "must do so under `if __name__ == '__main__':`" in done.stderr.splitlines()[-1]
@@ -297,20 +290,23 @@ def test_an_interrupted_close_leaves_nobody_behind():
 
 SCRIPT = """
 import sys
-from environments import TwoEnds, small_model
-from stable_baselines3.common.callbacks import BaseCallback
-from sb3_ddiffpg.callbacks.checkpoint import RunCheckpointCallback
-from sb3_ddiffpg.envs.vec_env.workers import WorkerVecEnv, _end
+from tiny_envs import TwoEnds
 
-class Tells(BaseCallback):
-    def _on_step(self):
-        if self.num_timesteps == 40:
-            print("running", flush=True)
-        return True
+if __name__ == "__main__":  # the workers read this file too
+    from sb3_ddiffpg.envs.vec_env.workers import WorkerVecEnv
 
-if __name__ == "__main__":
     env = WorkerVecEnv([TwoEnds] * 4, n_workers=2)
     if len(sys.argv) > 1:
+        from environments import small_model
+        from stable_baselines3.common.callbacks import BaseCallback
+        from sb3_ddiffpg.callbacks.checkpoint import RunCheckpointCallback
+
+        class Tells(BaseCallback):
+            def _on_step(self):
+                if self.num_timesteps == 40:
+                    print("running", flush=True)
+                return True
+
         small_model(env).learn(10**6, callback=[Tells(), RunCheckpointCallback(sys.argv[1], save_freq=10**6)])
         print("saved", flush=True)
 """

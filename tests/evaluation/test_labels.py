@@ -4,7 +4,7 @@ from functools import partial
 
 import gymnasium as gym
 import pytest
-from environments import TwoEnds, small_model
+from environments import Says, TwoEnds, small_model
 from gymnasium.wrappers import TimeLimit, TransformReward
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
@@ -15,21 +15,6 @@ from sb3_ddiffpg.envs.vec_env import WorkerVecEnv
 from sb3_ddiffpg.evaluation import clustering_agreement, evaluate_modes, run_episodes
 from sb3_ddiffpg.experiments.curve import CurveCallback
 from sb3_ddiffpg.zoo.commands import OutcomeVecEnv
-
-
-class Says(TwoEnds):
-    """Has a "mode" in its info: by which end the episode ended, or something else."""
-
-    def __init__(self, listed=None, what=None, **kwargs):
-        super().__init__(**kwargs)
-        self.what = what
-        if listed is not None:
-            self.listed_modes = listed
-
-    def step(self, action):
-        *rest, info = super().step(action)
-        return *rest, {**info, "mode": self.what or ("left" if self.x < 0 else "right")}
-
 
 FOREIGN, LABELLED = partial(Says, what="train"), partial(Says, ())
 

@@ -23,7 +23,7 @@ from sb3_ddiffpg.experiments import machine, training  # noqa: F401 - imported h
 from sb3_ddiffpg.experiments.ablations import ABLATIONS
 from sb3_ddiffpg.experiments.curve import Clock, CurveCallback
 
-SMALL = "{n_timesteps: 1600, learning_starts: 320, n_envs: 4, policy_kwargs: 'dict(net_arch=[16])'}"
+SMALL = "{n_timesteps: 800, learning_starts: 320, n_envs: 4, policy_kwargs: 'dict(net_arch=[16])'}"
 
 
 TESTS = "{n_tests: 3, n_test_episodes: 2, n_episodes: 3}"
@@ -41,7 +41,7 @@ def record(monkeypatch, folder, *arguments):
 def test_a_run_leaves_its_record_and_can_be_repeated(monkeypatch, tmp_path, capsys):
     first = record(monkeypatch, tmp_path / "a", "--env", "PointMazeV1-v0", "--seed", "5", "--override", SMALL)
     assert (first["env"], first["seed"], first["hyperparams"]["n_envs"]) == ("PointMazeV1-v0", 5, 4)
-    assert first["result"]["steps"] == 1600 and first["versions"]["torch"] and first["machine"]["cores"] >= 1
+    assert first["result"]["steps"] == 800 and first["versions"]["torch"] and first["machine"]["cores"] >= 1
     with (tmp_path / "a" / "curve.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["step"]) for row in rows] == sorted(int(row["step"]) for row in rows) and len(rows) == 3
@@ -185,19 +185,19 @@ def test_settings_that_do_not_exist(monkeypatch, tmp_path, capsys):
 
 
 def test_the_best_model_comes_with_its_normalisation(monkeypatch, tmp_path):
-    settings = SMALL.replace("1600", "1e3").replace("{", "{normalize: {norm_obs: true, norm_reward: false}, ")
+    settings = SMALL.replace("800", "6e2").replace("{", "{normalize: {norm_obs: true, norm_reward: false}, ")
     done = record(monkeypatch, tmp_path / "run", "--env", "PointMazeV1-v0", "--override", settings)
     assert done["result"]["complete"] and (tmp_path / "run" / "vecnormalize.pkl").is_file()
 
 
 def test_an_ensemble_shares_the_steps(monkeypatch, tmp_path):
     """Three trainings of a third each, evaluated as one model with a mode for each; it goes on where it was killed."""
-    settings = SMALL.replace("1600", "2400").replace("n_envs: 4", "n_envs: 4, n_steps: 1")
+    settings = SMALL.replace("800", "1200").replace("n_envs: 4", "n_envs: 4, n_steps: 1")
     command = ("--algo", "td3_c51", "--env", "PointMazeV1-v0", "--seed", "2", "--members", "3", "--override", settings)
     done = record(monkeypatch, tmp_path, *command)
     members = [yaml.safe_load((tmp_path / f"member_{k}" / "config.yml").read_text()) for k in range(3)]
     assert [member["seed"] for member in members] == [6, 7, 8]
-    assert done["result"]["steps"] == sum(member["result"]["steps"] for member in members) == 2400
+    assert done["result"]["steps"] == sum(member["result"]["steps"] for member in members) == 1200
     for part, seconds in done["result"]["seconds"].items():
         assert seconds == pytest.approx(sum(member["result"]["seconds"][part] for member in members)), part
     found = ModeEvaluation.load(tmp_path / "evaluation.json")
@@ -231,7 +231,7 @@ def test_what_was_trained_is_tested_elsewhere_too(monkeypatch, tmp_path):
 def test_a_trial_ends_with_the_process_that_started_it(tmp_path):
     """Its standard input closes: it writes a checkpoint and ends."""
     command = [sys.executable, "-m", "sb3_ddiffpg.experiments", "trial", "--env", "PointMazeV1-v0", "--attached"]
-    command += ["--override", SMALL.replace("1600", "1e8"), "--tests", TESTS, "--out", str(tmp_path)]
+    command += ["--override", SMALL.replace("800", "1e8"), "--tests", TESTS, "--out", str(tmp_path)]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
     while not (tmp_path / "logs" / "progress.json").exists():

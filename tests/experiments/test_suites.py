@@ -14,9 +14,9 @@ from filelock import FileLock
 
 from sb3_ddiffpg.experiments import __main__ as cli
 from sb3_ddiffpg.experiments import execution
-from sb3_ddiffpg.experiments.execution import LocalExecutor, TrialFailed, command_of
+from sb3_ddiffpg.experiments.execution import LocalExecutor, TrialFailed
 from sb3_ddiffpg.experiments.progress import Progress, read_progress, write_progress
-from sb3_ddiffpg.experiments.record import is_complete, recorded_trial
+from sb3_ddiffpg.experiments.record import is_complete, new_record, recorded_trial
 from sb3_ddiffpg.experiments.run import missing_trials, run_suite
 from sb3_ddiffpg.experiments.suite import Resources, read_suite, suite_names
 from sb3_ddiffpg.experiments.trial import setting_of
@@ -28,7 +28,7 @@ variants:
   ddiffpg: {settings: {policy_kwargs: "dict(net_arch=[16])"}}
   "td3_c51, wide": {algo: td3_c51}
 seeds: [0]
-settings: {n_timesteps: 1600, n_envs: 4}
+settings: {n_timesteps: 800, n_envs: 4}
 tests: {n_tests: 2, n_test_episodes: 2, n_episodes: 3}
 """
 # Under which nothing else is refused
@@ -172,7 +172,7 @@ def test_every_suite_of_the_package_can_be_run(name):
         (("seeds: [0]", "seeds: [0]\nablation: nonsense"), "ablation"),
         (("seeds: [0]", "seeds: [0]\nconf_file: tiny.yml"), "conf-file"),
         (("{algo: td3_c51}", "{algo: td3_c51, members: 2000}"), "members"),
-        (("{n_timesteps: 1600", "{normalize: true, n_timesteps: 1600"), "normalize"),
+        (("{n_timesteps: 800", "{normalize: true, n_timesteps: 800"), "normalize"),
     ],
 )
 def test_a_suite_that_cannot_be_is_refused_before_anything_runs(tiny, tmp_path, capsys, change, said):
@@ -246,7 +246,7 @@ def _processes():
 
 def test_a_process_that_dies_is_started_again(tiny, tmp_path):
     """And goes on from its checkpoint: the file that the dead one left says so."""
-    tiny.write_text(TINY.replace("n_timesteps: 1600", "n_timesteps: 6000"))
+    tiny.write_text(TINY.replace("n_timesteps: 800", "n_timesteps: 2400"))
     suite = read_suite(str(tiny), variants=["ddiffpg"])
     place = next(iter(suite.trials()))
     executor = LocalExecutor(workers=1, retries=1)
@@ -300,11 +300,17 @@ def test_what_lost_its_evaluation_is_not_complete(tmp_path):
 
 def test_what_fails_is_named_and_the_others_go_on(tiny, tmp_path, monkeypatch, capsys):
     """After all attempts."""
-    real = command_of
+    # What a training leaves, without its training
+    finished = (
+        "import os, sys; os.chdir(sys.argv[1]); "
+        "open('config.yml', 'w').write(sys.argv[2]); open('evaluation.json', 'w').close()"
+    )
 
     def broken(trial, folder):
-        command = real(trial, folder)
-        return command if trial.algo == "ddiffpg" else [sys.executable, "-c", "print('once'); raise SystemExit(3)"]
+        if trial.algo != "ddiffpg":
+            return [sys.executable, "-c", "print('once'); raise SystemExit(3)"]
+        record = yaml.safe_dump({**new_record(trial, folder), "result": {"complete": True}})
+        return [sys.executable, "-c", finished, str(folder), record]
 
     monkeypatch.setattr(execution, "command_of", broken)
     with pytest.raises(SystemExit, match="1 trials failed: PointMazeV1-v0/td3_c51, wide/seed0"):
@@ -317,7 +323,7 @@ def test_what_fails_is_named_and_the_others_go_on(tiny, tmp_path, monkeypatch, c
 
 def test_ctrl_c_ends_all_with_a_checkpoint(tiny, tmp_path, start):
     """And the same command goes on."""
-    tiny.write_text(TINY.replace("n_timesteps: 1600", "n_timesteps: 100000000"))
+    tiny.write_text(TINY.replace("n_timesteps: 800", "n_timesteps: 100000000"))
     command = [sys.executable, "-m", "sb3_ddiffpg.experiments", "run", str(tiny), "--out", str(tmp_path / "out")]
     # In the background a shell may have told processes to ignore it
     script = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
@@ -331,7 +337,7 @@ def test_ctrl_c_ends_all_with_a_checkpoint(tiny, tmp_path, start):
 
 
 def test_a_runner_that_is_killed_leaves_no_process(tiny, tmp_path, start):
-    tiny.write_text(TINY.replace("n_timesteps: 1600", "n_timesteps: 100000000"))
+    tiny.write_text(TINY.replace("n_timesteps: 800", "n_timesteps: 100000000"))
     command = [sys.executable, "-m", "sb3_ddiffpg.experiments", "run", str(tiny), "--out", str(tmp_path / "out")]
     process = start(command)
     _wait_for(lambda: len(list((tmp_path / "out").rglob("progress.json"))) == 2)
@@ -344,7 +350,8 @@ def test_a_runner_that_is_killed_leaves_no_process(tiny, tmp_path, start):
 
 def test_a_suite_that_is_killed_goes_on_and_repeats_nothing(tiny, tmp_path, start, capsys):
     """The runner and what it runs, all by SIGKILL, when one of two trials is complete."""
-    tiny.write_text(TINY.replace("n_timesteps: 1600", "n_timesteps: 6000"))
+    text = TINY.replace("n_timesteps: 800", "n_timesteps: 2400")
+    tiny.write_text(text.replace("settings: {policy_kwargs", "settings: {n_timesteps: 800, policy_kwargs"))
     out = tmp_path / "out"
     arguments = ["run", str(tiny), "--out", str(out), "--workers", "1", "--no-report"]
     process = start([sys.executable, "-m", "sb3_ddiffpg.experiments", *arguments])
@@ -386,7 +393,7 @@ def test_a_local_executor_that_is_stopped_runs_nothing_more(tiny, tmp_path):
 def test_a_ray_worker_that_is_killed_is_replaced(tmp_path, start):
     """On a local Ray with two workers, one of them killed in the middle, with what it runs."""
     path = tmp_path / "tiny.yml"
-    path.write_text(TINY.replace("n_timesteps: 1600", "n_timesteps: 12000"))
+    path.write_text(TINY.replace("n_timesteps: 800", "n_timesteps: 12000"))
     command = [sys.executable, "-m", "sb3_ddiffpg.experiments", "run", str(path), "--out", str(tmp_path / "out")]
     process = start([*command, "--ray", "--workers", "2", "--no-report"])
     place = tmp_path / "out" / "PointMazeV1-v0" / "ddiffpg" / "seed0"

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 from environments import copied
+from scipy.signal import lfilter
 
 from sb3_ddiffpg.buffers.returns import discounted_returns
 from sb3_ddiffpg.networks.value_range import ValueRange
@@ -102,6 +103,13 @@ def test_episodes_that_were_cut_off_would_have_gone_on_as_they_ended():
     np.testing.assert_allclose(discounted_returns(rewards, 0.0, "goes on"), rewards[::-1])
     np.testing.assert_allclose(discounted_returns(rewards, 1.0, "goes on"), rewards[::-1].cumsum())
     np.testing.assert_array_equal(rewards[2:], -1.0)  # what was given is as it was
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.9, 0.997, 1.0])
+def test_returns_like_those_of_scipy_bit_for_bit(gamma):
+    rewards = np.random.default_rng(0).normal(size=300).astype(np.float32)
+    expected = lfilter([1.0], [1.0, -gamma], rewards[::-1].astype(np.float64))
+    np.testing.assert_array_equal(discounted_returns(rewards, gamma), expected)
 
 
 def test_the_explorers_have_a_unit_of_their_own():

@@ -1,64 +1,16 @@
 """Vectorised environments that live in groups elsewhere: what is asked of each group, and how the answers come together."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_ddiffpg.envs.snapshots import env_snapshot, restore_env
-from sb3_ddiffpg.envs.vec_env.tracing import TracedEnvs
+from sb3_ddiffpg.envs.vec_env.group import NOBODY, by_name
 from sb3_ddiffpg.serialization.safetensors_tree import convert
-
-# Before the first environment's turn
-NOBODY = -1
-
-
-def make_group(env_fns: Sequence[Callable[[], gym.Env]], turn: Any) -> DummyVecEnv:
-    """
-    :param env_fns: functions that make the environments
-    :param turn: its ``value`` says whose turn it is
-    :return: the environments
-    """
-    made = []
-    for env_idx, make in enumerate(env_fns):
-        turn.value = env_idx
-        made.append(make())
-    envs = DummyVecEnv([partial(made.__getitem__, i) for i in range(len(made))])
-    envs.envs = TracedEnvs(made, turn)
-    return envs
-
-
-def answer_of(envs: Any, command: str, argument: Any) -> Any:
-    """
-    :param envs: what ``make_group`` gave
-    :param command: what they are to do
-    :param argument: of the command
-    :return: the answer
-    """
-    if command == "reset":
-        envs._seeds, envs._options = argument
-        return envs.reset(), envs.reset_infos
-    if command == "step":
-        return *envs.step(argument), envs.reset_infos
-    if command == "state_dict":
-        return [env_snapshot(env) for env in envs.envs]
-    if command == "load_state_dict":
-        for env, state in zip(envs.envs, argument, strict=True):
-            restore_env(env, state)
-        return None
-    name, arguments, keywords = argument
-    indices = keywords.pop("indices", None)
-    if indices is None:
-        return getattr(envs, name)(*arguments, **keywords)
-    answers = []
-    for env_idx in indices:
-        answers.append((getattr(envs, name)(*arguments, **keywords, indices=[env_idx]) or [None])[0])
-    return answers
 
 
 def check_groups(n_workers: int | None, timeout: float | None) -> None:
@@ -84,7 +36,7 @@ def first_of_groups(n_envs: int, n_groups: int) -> np.ndarray:
 
 class GroupedVecEnv(VecEnv):
     """
-    Environments in groups, each of which is one ``DummyVecEnv`` somewhere else. A subclass says how they are asked.
+    Environments in groups, each of which is one ``EnvGroup`` somewhere else. A subclass says how they are asked.
     """
 
     #: First environment of each group, and the number of environments
@@ -174,7 +126,7 @@ class GroupedVecEnv(VecEnv):
         self._ask("load_state_dict", self._split(states))
 
     def _each(self, name: str, indices: VecEnvIndices, *arguments: Any, **keywords: Any) -> list[Any]:
-        """Call a method of the groups' ``DummyVecEnv`` for some environments, which are given it as ``indices``."""
+        """Call a method of the groups' ``EnvGroup`` for some environments, which are given it as ``indices``."""
         chosen = list(self._get_indices(indices))
         local = [[i - first for i in chosen if first <= i < last] for first, last in self._ranges()]
         answers = self._ask("call", [(name, arguments, {**keywords, "indices": part}) for part in local])
@@ -224,7 +176,7 @@ class GroupedVecEnv(VecEnv):
         :param indices: which environments, None for all
         :return: one answer per environment
         """
-        return self._each("env_is_wrapped", indices, wrapper_class)
+        return self._each("env_is_wrapped", indices, by_name(wrapper_class))
 
     def has_attr(self, attr_name: str) -> bool:
         """

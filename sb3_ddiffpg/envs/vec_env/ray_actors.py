@@ -1,8 +1,6 @@
 """Environments in the actors of a Ray cluster, for simulators that outgrow one machine."""
 
 import math
-import traceback
-import types
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,30 +8,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_ddiffpg.envs.vec_env.grouped import NOBODY, GroupedVecEnv, answer_of, check_groups, first_of_groups, make_group
+from sb3_ddiffpg.envs.vec_env.group import NOBODY, Actor
+from sb3_ddiffpg.envs.vec_env.grouped import GroupedVecEnv, check_groups, first_of_groups
 
 # Losses of one group in a row, without an answer between them, after which there is no further one
 MOST_LOSSES = 3
-
-
-class _Group:
-    """
-    An actor: a group of environments on some machine. It answers ``("ok", result)`` or ``("error", (environment, lacks,
-    text))``, where ``lacks`` says whether it was an AttributeError. So an exception that arrives is always one of Ray's.
-    """
-
-    def __init__(self) -> None:
-        self.envs: Any = None
-        self.turn = types.SimpleNamespace(value=NOBODY)
-
-    def answer(self, command: str, argument: Any) -> tuple[str, Any]:
-        try:
-            if command == "make":
-                self.envs = make_group(argument, self.turn)
-                return "ok", (self.envs.observation_space, self.envs.action_space, self.envs.render_mode)
-            return "ok", answer_of(self.envs, command, argument)
-        except Exception as error:
-            return "error", (self.turn.value, isinstance(error, AttributeError), traceback.format_exc())
 
 
 class RayVecEnv(GroupedVecEnv):
@@ -77,7 +56,7 @@ class RayVecEnv(GroupedVecEnv):
         n_workers = min(n_workers, len(env_fns))
         self.first = first_of_groups(len(env_fns), n_workers)
         self._env_fns = [list(env_fns[first:last]) for first, last in self._ranges()]
-        self._actor: Any = ray.remote(**{"scheduling_strategy": "SPREAD", **(options or {})})(_Group)
+        self._actor: Any = ray.remote(**{"scheduling_strategy": "SPREAD", **(options or {})})(Actor)
         self._closed = False
         self._asked: list[tuple[str, Any, Any]] = []
         #: Of each group what it saw last, and what a new one begins with that has taken its place since the latest step

@@ -1,33 +1,14 @@
 """Environments that are stepped one after the other, and whose turn it was when one of them raised."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
-from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-
-class TracedEnvs(list):
-    """
-    Environments, of which it can be seen whose turn it was last.
-
-    :param envs: the environments
-    :param turn: its ``value`` becomes the index of the one that is taken out of the list
-    """
-
-    def __init__(self, envs: Sequence[gym.Env], turn: Any) -> None:
-        super().__init__(envs)
-        self.turn = turn
-
-    def __getitem__(self, index: Any) -> Any:
-        self.turn.value = index
-        return super().__getitem__(index)
-
-    def __iter__(self) -> Iterator[gym.Env]:
-        return (self[index] for index in range(len(self)))
+from sb3_ddiffpg.envs.vec_env.group import TracedEnvs
 
 
 class TracingDummyVecEnv(DummyVecEnv):

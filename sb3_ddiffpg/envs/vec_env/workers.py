@@ -3,52 +3,18 @@
 import contextlib
 import math
 import multiprocessing
-import signal
-import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 from multiprocessing.util import Finalize
 from typing import Any, NoReturn
 
 import gymnasium as gym
-from stable_baselines3.common.vec_env import CloudpickleWrapper, DummyVecEnv
 
-from sb3_ddiffpg.envs.vec_env.grouped import NOBODY, GroupedVecEnv, answer_of, check_groups, first_of_groups, make_group
+from sb3_ddiffpg.envs.vec_env.group import NOBODY
+from sb3_ddiffpg.envs.vec_env.grouped import GroupedVecEnv, check_groups, first_of_groups
+from sb3_ddiffpg.envs.vec_env.worker_process import Pickled, work
 from sb3_ddiffpg.utils.processors import n_processors
 from sb3_ddiffpg.utils.signals import uninterrupted
-
-
-def _work(remote: Connection, parent: Connection, wrapped: CloudpickleWrapper, turn: Any) -> None:
-    """
-    What a worker does: it answers each command with ``("ok", result)`` or ``("error", (environment, lacks, text))``, where
-    ``lacks`` says whether it was an AttributeError; a class of one's own may be known here alone.
-    """
-    parent.close()
-    for number in (signal.SIGINT, signal.SIGTERM):  # they may reach all processes; the parent says what happens now
-        signal.signal(number, signal.SIG_IGN)
-    envs: DummyVecEnv | None = None
-    while True:
-        try:
-            command, argument = remote.recv()
-        except EOFError:
-            break  # the parent is gone
-        answered = False
-        try:
-            if command == "make":
-                envs = make_group(wrapped.var, turn)
-                result: Any = (envs.observation_space, envs.action_space, envs.render_mode)
-            elif command == "close":
-                break
-            else:
-                result = answer_of(envs, command, argument)
-            answered = True
-            remote.send(("ok", result))
-        except Exception as error:  # of an environment, or of an answer that cannot be sent
-            lacks = isinstance(error, AttributeError) and not answered
-            remote.send(("error", (NOBODY if answered else turn.value, lacks, traceback.format_exc())))
-    if envs is not None:
-        envs.close()
-    remote.close()
 
 
 def _end(remotes: Sequence[Connection], processes: Sequence[Any]) -> None:
@@ -70,7 +36,8 @@ def _end(remotes: Sequence[Connection], processes: Sequence[Any]) -> None:
 class WorkerVecEnv(GroupedVecEnv):
     """
     SB3's ``SubprocVecEnv`` with several environments in each process: one process for each of many environments costs more
-    memory than the environments, and time to tell each its action.
+    memory than the environments, and time to tell each its action. A worker imports SB3 and PyTorch only if an environment
+    does, or the script's own file outside of ``if __name__ == "__main__":``.
 
     An environment that raises or hangs, and a worker that dies, end the run with an error that names the environment and the
     cause.
@@ -102,7 +69,7 @@ class WorkerVecEnv(GroupedVecEnv):
             turn = context.RawValue("i", NOBODY)
             # A daemon, so that it does not outlive a crash of this process
             process = context.Process(
-                target=_work, args=(theirs, remote, CloudpickleWrapper(list(env_fns[first:last])), turn), daemon=True
+                target=work, args=(theirs, remote, Pickled(list(env_fns[first:last])), turn), daemon=True
             )
             process.start()
             self._turns.append(turn)
