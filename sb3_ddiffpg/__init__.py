@@ -1,10 +1,11 @@
 """DDiffPG for Stable-Baselines3: find several solutions of one task, keep them, name them and choose one."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import lazy_loader
 
 import sb3_ddiffpg.envs  # noqa: F401 - registers the environments
 from sb3_ddiffpg.saving import _legacy
-from sb3_ddiffpg.utils.lazy import Lazy
 
 if TYPE_CHECKING:
     from sb3_ddiffpg.buffers import ModeReplayBuffer
@@ -29,27 +30,17 @@ __all__ = [
     "check_env",
 ]
 
-_lazy = Lazy(
+# The rest is imported when it is asked for: a worker process needs none of PyTorch
+__getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
+    ["buffers", "callbacks", "check", "clustering", "common", "ddiffpg", "evaluation", "exploration", "modes", "networks"],
     {
-        **dict.fromkeys(
-            ("ClusteringCallback", "EvaluateModesCallback", "ModeEvalCallback", "ModeFigureCallback"), "callbacks"
-        ),
-        **dict.fromkeys(("DDiffPG", "DiffusionPolicy"), "ddiffpg"),
-        **dict.fromkeys(("EnvCheck", "check_env"), "check"),
-        **dict.fromkeys(("Mode", "ModeTable"), "modes"),
-        "ModeReplayBuffer": "buffers",
+        "buffers": ["ModeReplayBuffer"],
+        "callbacks": ["ClusteringCallback", "EvaluateModesCallback", "ModeEvalCallback", "ModeFigureCallback"],
+        "check": ["EnvCheck", "check_env"],
+        "ddiffpg": ["DDiffPG", "DiffusionPolicy"],
+        "modes": ["Mode", "ModeTable"],
     },
-    ("buffers", "callbacks", "check", "clustering", "common", "ddiffpg", "evaluation", "exploration", "modes", "networks"),
 )
-
-
-def __getattr__(name: str) -> Any:
-    return _lazy(name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
-
 
 _legacy.install()

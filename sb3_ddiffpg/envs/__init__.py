@@ -9,12 +9,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+import lazy_loader
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from sb3_ddiffpg.envs.mazes.homotopy import HomotopyTracker
 from sb3_ddiffpg.envs.mazes.maze import LISTED_ROUTES, MAZES, Maze, reduce_word
 from sb3_ddiffpg.envs.wrappers import HideGoal
-from sb3_ddiffpg.utils.lazy import Lazy
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -37,14 +37,10 @@ __all__ = [
     "registered_spec",
 ]
 
-_lazy = Lazy(
-    __name__, dict.fromkeys(("PointMazeEnv", "PointMazeVecEnv"), "mazes.point"), ("description", "snapshots", "vec_env")
+# The rest is imported when it is asked for: a worker process needs none of PyTorch
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__, ["description", "snapshots", "vec_env"], {"mazes.point": ["PointMazeEnv", "PointMazeVecEnv"]}
 )
-
-
-def __getattr__(name: str) -> Any:
-    return _lazy(name)
-
 
 # Single environment -> the class that steps many of them together. Strings, so that simulators are imported when needed
 _VEC_ENVS = {

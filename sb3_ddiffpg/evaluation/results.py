@@ -4,7 +4,6 @@ import json
 import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -48,12 +47,10 @@ class CommandResult:
     @property
     def success_interval(self) -> tuple[float, float]:
         """Its 95 % Wilson interval."""
-        # As ``scipy.stats.binomtest``, which is slow to import
-        n, share, z2 = self.n_episodes, self.success_rate, NormalDist().inv_cdf(0.975) ** 2
-        centre, half = share + z2 / (2 * n), math.sqrt(z2 * (share * (1 - share) / n + z2 / (4 * n * n)))
-        low = 0.0 if self.n_successes == 0 else (centre - half) / (1 + z2 / n)
-        high = 1.0 if self.n_successes == n else (centre + half) / (1 + z2 / n)
-        return low, high
+        from scipy.stats import binomtest  # slow to import
+
+        interval = binomtest(self.n_successes, self.n_episodes).proportion_ci(method="wilson")
+        return float(interval.low), float(interval.high)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Vectorised environments that say where an error was raised: in this process, in workers, or on a Ray cluster."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from sb3_ddiffpg.utils.lazy import Lazy
+import lazy_loader
 
 if TYPE_CHECKING:
     from sb3_ddiffpg.envs.vec_env.ray_actors import RayVecEnv
@@ -11,11 +11,8 @@ if TYPE_CHECKING:
 
 __all__ = ["RayVecEnv", "TracingDummyVecEnv", "WorkerVecEnv"]
 
-_lazy = Lazy(
+# Each alone: a worker process needs none of SB3
+__getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
-    {"RayVecEnv": "ray_actors", "TracingDummyVecEnv": "tracing", "WorkerVecEnv": "workers"},
+    submod_attrs={"ray_actors": ["RayVecEnv"], "tracing": ["TracingDummyVecEnv"], "workers": ["WorkerVecEnv"]},
 )
-
-
-def __getattr__(name: str) -> Any:
-    return _lazy(name)
