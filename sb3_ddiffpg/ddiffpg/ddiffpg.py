@@ -52,8 +52,8 @@ class DDiffPG(ActorCriticAlgorithm):
     Deep Diffusion Policy Gradient (DDiffPG): learns several ways to solve one task.
 
     Paper: https://arxiv.org/abs/2406.00681 (Li et al., NeurIPS 2024). How this implementation differs from it is listed in
-    ``docs/algorithm/ddiffpg.md``. The defaults suit a laptop; the paper's own numbers are in ``zoo_hyperparams/ddiffpg.yml``,
-    from which ``from_preset`` takes them.
+    ``docs/algorithm/deviations.md``. The defaults suit a laptop; the paper's own numbers are in
+    ``zoo_hyperparams/ddiffpg.yml``, from which ``from_preset`` takes them.
 
     :param policy: ``"DiffusionPolicy"``, ``"MlpPolicy"`` (the same), ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict
         observations) or a class
