@@ -1,8 +1,11 @@
-"""Pages lead where they say: files and headings. Needs nothing that builds the site."""
+"""Pages lead where they say, every public name has a page, and the quickstart runs. Needs nothing that builds the site."""
 
+import ast
 import re
 import subprocess
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)(?: \"[^\"]*\")?\)")
@@ -55,3 +58,79 @@ def test_a_dead_link_is_found(tmp_path):
     page = tmp_path / "a.md"
     page.write_text("# A `b`: c\n\n[1](a.md#a-b-c) [2](a.md#a) [3](#a-b-c) [4](b.md) ![5](b.png) [6](https://b) `[7](c)`\n")
     assert dead_links(page) == ["a.md#a", "b.md", "b.png"]
+
+
+def offered(package: Path) -> set[tuple[str, str]]:
+    """
+    :param package: Its folder
+    :return: Module and name of all that any ``__all__`` lists
+    """
+    found = set()
+    for file in package.rglob("*.py"):
+        parts = file.relative_to(package.parent).with_suffix("").parts
+        module = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        for node in ast.parse(file.read_text()).body:
+            if isinstance(node, ast.Assign) and [ast.unparse(each) for each in node.targets] == ["__all__"]:
+                found |= {(module, name) for name in ast.literal_eval(node.value)}
+    return found
+
+
+def listed(pages: list[str]) -> set[tuple[str, str]]:
+    """
+    :param pages: Texts of API pages
+    :return: Module and name of all that they describe
+    """
+    lists = re.compile(r"^\.\. public-api:: (\S+)\n\n((?:   \S+\n)+)", re.MULTILINE)
+    return {(module, name) for page in pages for module, names in lists.findall(page) for name in names.split()}
+
+
+def test_every_public_name_has_a_page():
+    pages = [page.read_text() for page in (ROOT / "docs" / "api").glob("*.rst")]
+    public = offered(ROOT / "sb3_ddiffpg")
+    assert len(public) > 90
+    assert not (missing := sorted(public - listed(pages))), missing
+
+
+def test_settings_have_a_page():
+    page = (ROOT / "docs" / "api" / "settings.rst").read_text()
+    groups = {
+        name
+        for file in ROOT.glob("sb3_ddiffpg/*/settings.py")
+        for name in re.findall(r"^class (\w+)\(Settings", file.read_text(), re.M)
+    }
+    assert len(groups) == 5
+    assert groups <= {name for _, name in listed([page])}
+
+
+def test_a_name_without_a_page_is_found(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "__init__.py").write_text('__all__ = ["B", "c"]')
+    page = ".. public-api:: a\n\n   B\n   b.d\n\nWords\n"
+    assert offered(tmp_path / "a") - listed([page]) == {("a", "c")}
+
+
+def test_every_page_is_in_the_navigation():
+    """The site's build asks for it too."""
+    index = (ROOT / "docs" / "index.md").read_text() + (ROOT / "docs" / "results" / "index.md").read_text()
+    named = {re.sub(r"^.*<(.*)>$", r"\1", line).lstrip("/") for line in index.splitlines()}
+    for page in pages():
+        name = page.relative_to(ROOT).with_suffix("").as_posix()
+        if name.startswith("docs/") and name != "docs/index":
+            assert named & {name.removeprefix("docs/"), name.removeprefix("docs/results/")}, name
+
+
+def quickstart() -> str:
+    (code,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "quickstart.md").read_text(), re.MULTILINE | re.DOTALL)
+    return code
+
+
+def test_quickstart_is_short():
+    assert len([line for line in quickstart().splitlines() if line]) <= 20
+
+
+@pytest.mark.slow
+def test_quickstart_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(compile(quickstart(), "quickstart.md", "exec"), names)
+    assert "uncommanded: 2.00 modes expected" in capsys.readouterr().out
