@@ -1,14 +1,19 @@
-# Everything happens in .venv, which is made and filled on first use and again when the dependencies change.
+# Everything happens in .venv, which is made and filled on first use and again when the dependencies change; the documentation in
+# a small one of its own.
 PYTHON := $(shell python3.11 -c "print('python3.11')" 2>/dev/null || echo python3)
 BIN := .venv/bin
 DEPENDENCIES := setup.cfg pyproject.toml constraints.txt
 
-.PHONY: demo test fast slow gpu fuzz oldest soak lint type format bench clean
+.PHONY: demo test docs fast slow gpu fuzz oldest soak lint type format bench clean
 
 demo: .venv/.installed
 	$(BIN)/python examples/demo.py
 
 test: lint type fast
+
+# a warning or a dead link is an error
+docs: .venv-docs/.installed
+	.venv-docs/bin/sphinx-build --quiet --fresh-env --fail-on-warning --keep-going -c docs -d build/doctrees . build/docs
 
 # one torch thread per worker: the workers already fill the cores
 fast: .venv/.installed-dev
@@ -54,7 +59,7 @@ bench: .venv/.installed-dev
 	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
 
 clean:
-	rm -rf .venv .venv-oldest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-docs .venv-oldest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
 
 .venv/.installed: $(DEPENDENCIES) | .venv
 	$(BIN)/pip install --quiet -c constraints.txt -e ".[zoo,plots]"
@@ -63,6 +68,12 @@ clean:
 .venv/.installed-dev: $(DEPENDENCIES) | .venv
 	$(BIN)/pip install --quiet -c constraints.txt -e ".[all,dev]"
 	touch $@ .venv/.installed
+
+# the extra alone, without what the package itself needs, which pip would install too
+.venv-docs/.installed: $(DEPENDENCIES)
+	$(PYTHON) -m venv --clear .venv-docs
+	.venv-docs/bin/pip install --quiet -c constraints.txt $$(sed -n '/^docs =/,/^[a-z]/s/^    \([a-z]\)/\1/p' setup.cfg)
+	touch $@
 
 .venv:
 	$(PYTHON) -m venv .venv

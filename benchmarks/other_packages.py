@@ -1,6 +1,6 @@
 """
 Environments of other packages, each in a virtual environment of its own with the pinned versions of ``packages/ROW.txt``: a
-training of a few thousand steps with DDiffPG's default settings in each. The rows of docs/environments.md were made by it.
+training of a few thousand steps with DDiffPG's default settings in each. It made the rows of docs/guides/environments.md.
 
 Usage: ``python benchmarks/other_packages.py [ROW ...] [--steps 4000] [--folder DIR] [--installed]``
 """

@@ -87,6 +87,7 @@ def test_metadata(wheel):
         "hub",
         "cluster",
         "onnx",
+        "docs",
         "fuzz",
         "dev",
         "all",

@@ -18,7 +18,7 @@ from sb3_ddiffpg.utils.settings import NOT_NEGATIVE, Accepted, at_least
 class DiffusionQL(Baseline):
     """
     Diffusion policies as an expressive policy class (Wang et al., 2023, https://arxiv.org/abs/2208.06193), here online: the
-    actor maximises Q_i(s, a) / mean |Q_j|, with a sampled through all T denoising steps and (i, j) by a coin, plus
+    actor maximises ``Q_i(s, a) / mean |Q_j|``, with a sampled through all T denoising steps and (i, j) by a coin, plus
     ``bc_coef`` times the denoising loss of the buffer's actions (1 in the original, 0 online). It acts with one of
     ``n_candidates`` actions, drawn by the softmax of their values.
 

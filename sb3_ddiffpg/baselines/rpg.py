@@ -93,7 +93,7 @@ class RPG(EntropyTuning):
     Reparameterised policy gradient (Huang et al., 2023, https://arxiv.org/abs/2307.10710): each episode draws a latent
     variable z, which the policy pi(a | s, z) sees. The policy climbs the lambda-return of its own rollouts in a learned model,
     plus the entropy of its actions and what they tell about z, so that different z act differently. Deviations are listed in
-    ``docs/baselines.md``.
+    ``docs/algorithm/baselines.md``.
 
     :param policy: ``"MlpPolicy"``, ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)

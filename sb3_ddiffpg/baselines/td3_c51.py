@@ -69,7 +69,7 @@ class TD3C51(Baseline):
     """
     TD3 (Fujimoto et al., 2018, https://arxiv.org/abs/1802.09477) with C51 critics and NovelD. As in the DDiffPG paper's
     comparison the actor climbs the smaller of both critics at every update. What else differs from TD3, and by which arguments
-    it need not, is listed in ``docs/baselines.md``.
+    it need not, is listed in ``docs/algorithm/baselines.md``.
 
     :param policy: ``"MlpPolicy"``, ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict observations) or a class
     :param env: The environment to learn from (if registered in Gym, can be str)

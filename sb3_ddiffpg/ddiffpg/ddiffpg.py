@@ -52,8 +52,8 @@ class DDiffPG(ActorCriticAlgorithm):
     Deep Diffusion Policy Gradient (DDiffPG): learns several ways to solve one task.
 
     Paper: https://arxiv.org/abs/2406.00681 (Li et al., NeurIPS 2024). How this implementation differs from it is listed in
-    ``docs/ddiffpg.md``. The defaults suit a laptop; the paper's own numbers are in ``zoo_hyperparams/ddiffpg.yml``, from which
-    ``from_preset`` takes them.
+    ``docs/algorithm/deviations.md``. The defaults suit a laptop; the paper's own numbers are in
+    ``zoo_hyperparams/ddiffpg.yml``, from which ``from_preset`` takes them.
 
     :param policy: ``"DiffusionPolicy"``, ``"MlpPolicy"`` (the same), ``"CnnPolicy"`` (images), ``"MultiInputPolicy"`` (dict
         observations) or a class
@@ -561,7 +561,7 @@ class DDiffPG(ActorCriticAlgorithm):
 
     def export_onnx(self, path: str | os.PathLike, mode: str | int | Mode | None = None) -> None:
         """
-        Save the policy as one ONNX file, which acts without torch and this package, see ``docs/deployment.md``.
+        Save the policy as one ONNX file, which acts without torch and this package, see ``docs/guides/deployment.md``.
 
         Its inputs are ``observation`` (of a dict one for each key, ``observation.KEY``) as the environment gives it, [N, ...];
         ``mode``, the index of each row's mode or -1 for none, int64, [N]; and ``noise``, float32, [N, K, T, action_dim], of

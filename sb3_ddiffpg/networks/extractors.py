@@ -53,7 +53,7 @@ class ScaledFlattenExtractor(FlattenExtractor):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """
-        :param observations: Shape [N, *observation_space.shape]
+        :param observations: Shape ``[N, *observation_space.shape]``
         :return: Shape [N, features_dim]
         """
         flat = super().forward(observations)
@@ -83,7 +83,7 @@ class StandardizedExtractor(FlattenExtractor):
     @th.no_grad()
     def adapt(self, observations: th.Tensor) -> None:
         """
-        :param observations: From all over where the run has been, shape [N, *observation_space.shape], N at least 2
+        :param observations: From all over where the run has been, shape ``[N, *observation_space.shape]``, N at least 2
         """
         if self.is_fixed > 0:
             return
@@ -98,7 +98,7 @@ class StandardizedExtractor(FlattenExtractor):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """
-        :param observations: Shape [N, *observation_space.shape]
+        :param observations: Shape ``[N, *observation_space.shape]``
         :return: Shape [N, features_dim], within 10 of 0
         """
         return ((super().forward(observations) - self.offset) * self.scale).clamp(-FARTHEST, FARTHEST)

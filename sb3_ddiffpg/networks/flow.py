@@ -8,7 +8,7 @@ from sb3_ddiffpg.networks.denoiser import ActionModel, Denoiser, weighted_mean
 
 #: When the flow asks for its velocity. With the first time alone, a policy that may go left or right at a fork would go
 #: straight on: seen from pure noise, an action is the mean of all. The second decides; a later one than half-way more clearly,
-#: but then fewer routes were found (docs/lessons.md)
+#: but then fewer routes were found (docs/research_log/arithmetic.md)
 FLOW_TIMES = (1.0, 0.5)
 
 

@@ -280,7 +280,7 @@ def plot_values(model: Any, observations: np.ndarray, maze: Any = None, normaliz
     features. The mode's own route (its medoid) is drawn on top.
 
     :param model: A DDiffPG with modes
-    :param observations: Not normalised, shape [N, *observation shape], such as :func:`grid_observations` makes
+    :param observations: Not normalised, shape ``[N, *observation shape]``, such as :func:`grid_observations` makes
     :param maze: An ``envs.Maze`` that is drawn below
     :param normalizer: The ``VecNormalize`` with which the model was trained; that of its environment when None
     :return: The figure
@@ -315,7 +315,7 @@ def grid_observations(model: Any, observation: np.ndarray, maze: Any, spacing: f
     :param observation: One observation, for the components that are no position
     :param maze: An ``envs.Maze``
     :param spacing: Of the places, in metres
-    :return: Shape [N, *observation shape]
+    :return: Shape ``[N, *observation shape]``
     """
     x_low, x_high, y_low, y_high = maze.extent
     xs, ys = np.arange(x_low + spacing / 2, x_high, spacing), np.arange(y_low + spacing / 2, y_high, spacing)

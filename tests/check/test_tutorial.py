@@ -1,4 +1,4 @@
-"""What ``docs/your_own_environment.md`` tells a reader to do is done, from top to bottom."""
+"""What ``docs/tutorials/your_own_environment.md`` tells a reader to do is done, from top to bottom."""
 
 import os
 import re
@@ -13,7 +13,7 @@ import pytest
 from sb3_ddiffpg import DDiffPG, report
 from sb3_ddiffpg.check import command
 
-PAGE = Path(__file__).parents[2] / "docs" / "your_own_environment.md"
+PAGE = Path(__file__).parents[2] / "docs" / "tutorials" / "your_own_environment.md"
 COMMANDS = {"ddiffpg check": command.main, "python -m sb3_ddiffpg.report": report.main}
 # Few steps, in a room whose exit random actions reach in one episode of eight: enough for a first mode
 FEW = {

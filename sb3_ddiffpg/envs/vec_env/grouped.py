@@ -96,7 +96,7 @@ class GroupedVecEnv(VecEnv):
 
     def step_async(self, actions: np.ndarray) -> None:
         """
-        :param actions: shape (n_envs, *action shape)
+        :param actions: shape ``(n_envs, *action shape)``
         """
         self._tell("step", self._split(actions))
 
