@@ -10,9 +10,9 @@ demo: .venv/.installed
 
 test: lint type fast
 
-# one torch thread per worker: the workers already fill the cores
+# one torch thread per worker: the workers already fill the cores; one browser for all tests that need one
 fast: .venv/.installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
 
 slow: .venv/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m slow
@@ -33,7 +33,7 @@ oldest:
 	$(PYTHON) -m venv --clear .venv-oldest
 	.venv-oldest/bin/pip install --quiet uv
 	.venv-oldest/bin/uv pip install --python .venv-oldest/bin/python --quiet --resolution lowest-direct -e ".[franka,zoo,plots,hub,cluster,dev]"
-	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest -n 2
+	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest -n 2 --dist loadgroup
 
 # half an hour
 soak: .venv/.installed-dev

@@ -2,7 +2,13 @@
 
 import sb3_ddiffpg.envs  # noqa: F401 - registers the environments
 from sb3_ddiffpg.buffers import ModeReplayBuffer
-from sb3_ddiffpg.callbacks import ClusteringCallback, EvaluateModesCallback, ModeEvalCallback, ModeFigureCallback
+from sb3_ddiffpg.callbacks import (
+    ClusteringCallback,
+    EvaluateModesCallback,
+    LiveCallback,
+    ModeEvalCallback,
+    ModeFigureCallback,
+)
 from sb3_ddiffpg.check import EnvCheck, check_env
 from sb3_ddiffpg.ddiffpg import DDiffPG, DiffusionPolicy
 from sb3_ddiffpg.modes import Mode, ModeTable
@@ -16,6 +22,7 @@ __all__ = [
     "DiffusionPolicy",
     "EnvCheck",
     "EvaluateModesCallback",
+    "LiveCallback",
     "Mode",
     "ModeEvalCallback",
     "ModeFigureCallback",

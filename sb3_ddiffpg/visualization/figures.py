@@ -39,7 +39,7 @@ def draw_all(
     names = {mode.number: mode.name for mode in modes}
     figures = {}
     if episodes:
-        figures["routes"] = plots.plot_routes(episodes, maze, plots.colors_of(modes))
+        figures["routes"] = plots.plot_routes(episodes, maze, plots.colors_of(modes), plots.markers_of(modes))
     figures["success"] = plots.plot_success(model.mode_history, names)
     figures["timeline"] = plots.plot_timeline(model.mode_history, model.lifetime_steps)
     places = _places(model, maze, observation)
