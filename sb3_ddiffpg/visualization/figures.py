@@ -13,7 +13,7 @@ from sb3_ddiffpg.visualization import plots
 CAPTIONS = {
     "routes": "The routes that each mode takes when it is commanded. Dashed: the goal was not reached.",
     "success": "Success of each mode in training, exploration noise included. Grey: modes that have ended.",
-    "timeline": "When modes were born, split off, merged and ended.",
+    "timeline": "When modes were born, split off, merged and ended. Grey: modes that have ended.",
     "values": "What each mode's critics expect from where, and the mode's central route.",
     "exploration": "Where training went, and how much of the space it knew when.",
     "dendrogram": "How alike the goal-reached trajectories are, and to which mode each belongs.",

@@ -15,7 +15,7 @@ import jinja2
 import msgspec
 from markupsafe import Markup
 
-from sb3_ddiffpg.visualization.palette import mode_color, mode_symbol
+from sb3_ddiffpg.visualization.palette import GREY, styles
 from sb3_ddiffpg.visualization.sketch import Sketch
 
 # Within a script element these end it, or begin a comment
@@ -68,12 +68,13 @@ class Shown:
         """
         :return: Of the table of modes, the one to command first at the top
         """
+        looks = styles(mode.number for mode in self.sketch.modes)
         rows = [
             {
                 "index": index,
                 "name": mode.name,
-                "color": mode_color(mode.number),
-                "shape": mode_symbol(mode.number)[1],
+                "color": looks[mode.number].color,
+                "shape": looks[mode.number].shape,
                 "frozen": mode.frozen,
                 "best": mode.name == self.best,
                 "cells": self.cells.get(mode.name, ()),
@@ -92,7 +93,9 @@ class Shown:
             for mode in known["modes"]
         ]
         numbers = {each["number"] for part in ("modes", "lives", "courses") for each in known[part]}
-        looks = {number: {"color": mode_color(number), "symbol": mode_symbol(number)[0]} for number in sorted(numbers)}
+        looks = {number: {"color": GREY, "symbol": "circle"} for number in sorted(numbers)}
+        for number, style in styles(mode.number for mode in self.sketch.modes).items():
+            looks[number] = {"color": style.color, "symbol": style.symbol}
         return {**known, "label": self.label, "looks": looks, "tests": dict(self.tests)}
 
 

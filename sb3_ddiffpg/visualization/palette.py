@@ -1,5 +1,8 @@
 """How modes are told apart in pictures: the colours of Okabe and Ito, and a marker beside each. Needs no library."""
 
+from collections.abc import Iterable
+from dataclasses import dataclass
+
 #: The palette of M. Okabe and K. Ito, "Color Universal Design" (2008), with which colour-blind readers tell eight things apart
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
 #: Nine, so that seventy-two modes differ in one or the other: as Matplotlib calls them
@@ -20,26 +23,49 @@ SHAPES = (
 )
 
 
-def mode_color(number: int) -> str:
-    """
-    :param number: A mode's number
-    :return: Its colour in all pictures, ``"#rrggbb"``
-    """
-    return COLORS[number % len(COLORS)]
+#: Of a mode that has ended
+GREY = "#8a8a8a"
 
 
-def mode_marker(number: int) -> str:
+@dataclass(frozen=True)
+class Style:
     """
-    :param number: A mode's number
-    :return: Its marker in Matplotlib's pictures
+    How a mode looks.
+
+    :param color: ``"#rrggbb"``
+    :param marker: As Matplotlib calls it
+    :param symbol: The same marker, as Plotly calls it
+    :param shape: The same, as the path of an SVG of 16 by 16
     """
-    return MARKERS[number % len(MARKERS)]
+
+    color: str
+    marker: str
+    symbol: str
+    shape: str
 
 
-def mode_symbol(number: int) -> tuple[str, str]:
+def styles(numbers: Iterable[int]) -> dict[int, Style]:
     """
-    :param number: A mode's number
-    :return: The same marker on the page: Plotly's name, and the path of an SVG of 16 by 16
+    The first eight modes have a colour each, the first nine a marker; no two of the first 72 have both in common. A mode that
+    is born changes no other's.
+
+    :param numbers: Of the modes that are drawn together
+    :return: How each looks, by number
     """
-    index = number % len(MARKERS)
-    return SYMBOLS[index], SHAPES[index]
+    found: dict[int, Style] = {}
+    colors: list[int] = []
+    markers: list[int] = []
+    for place, number in enumerate(sorted(set(numbers))):
+        # Its own, or the next one that is free; once all are taken, they are taken again
+        color = _free(number % len(COLORS), len(COLORS), colors[place - place % len(COLORS) :])
+        marker = _free(number % len(MARKERS), len(MARKERS), markers[place - place % len(MARKERS) :])
+        while (color, marker) in zip(colors, markers, strict=True) and place < len(COLORS) * len(MARKERS):
+            marker = (marker + 1) % len(MARKERS)
+        colors.append(color)
+        markers.append(marker)
+        found[number] = Style(COLORS[color], MARKERS[marker], SYMBOLS[marker], SHAPES[marker])
+    return found
+
+
+def _free(wanted: int, n: int, taken: list[int]) -> int:
+    return next((index % n for index in range(wanted, wanted + n) if index % n not in taken), wanted)

@@ -17,7 +17,7 @@ from sb3_ddiffpg.evaluation.rollout import EpisodeResult
 from sb3_ddiffpg.exploration.visit_map import VisitMap
 from sb3_ddiffpg.modes.history import ModeHistory
 from sb3_ddiffpg.modes.mode import Mode
-from sb3_ddiffpg.visualization.palette import mode_color, mode_marker
+from sb3_ddiffpg.visualization.palette import GREY, styles
 from sb3_ddiffpg.visualization.sketch import lives
 
 # Share of the cells whose visits have a colour of their own; the rest, near the start, would outshine them
@@ -33,7 +33,8 @@ def colors_of(modes: Sequence[Mode]) -> dict[str, str]:
     :param modes: The modes of a model
     :return: Colour by name
     """
-    return {mode.name: mode_color(mode.number) for mode in modes}
+    looks = styles(mode.number for mode in modes)
+    return {mode.name: looks[mode.number].color for mode in modes}
 
 
 def markers_of(modes: Sequence[Mode]) -> dict[str, str]:
@@ -41,7 +42,8 @@ def markers_of(modes: Sequence[Mode]) -> dict[str, str]:
     :param modes: The modes of a model
     :return: Marker by name
     """
-    return {mode.name: mode_marker(mode.number) for mode in modes}
+    looks = styles(mode.number for mode in modes)
+    return {mode.name: looks[mode.number].marker for mode in modes}
 
 
 def _new(width: float, height: float) -> Figure:
@@ -158,9 +160,10 @@ def draw_routes(
     """
     if maze is not None:
         _draw_maze(axes, maze)
+    looks = styles(range(len(episodes)))
     for number, (name, runs) in enumerate(episodes.items()):
-        color = (colors or {}).get(name, mode_color(number))
-        marker = (markers or {}).get(name, mode_marker(number))
+        color = (colors or {}).get(name, looks[number].color)
+        marker = (markers or {}).get(name, looks[number].marker)
         for run in runs:
             style = "--" if run.success is False else "-"
             path, end = run.path[:, list(components)].T, {"marker": marker, "markevery": [-1], "ms": 5}
@@ -188,13 +191,15 @@ def plot_dendrogram(model: Any) -> Figure:
         owners.append(first if first == second else NO_MODE)
     figure = _new(9, 4)
     axes = figure.subplots()
-    colors = ["0.6" if owner == NO_MODE else mode_color(modes[owner].number) for owner in owners]
+    looks = styles(mode.number for mode in modes)
+    colors = ["0.6" if owner == NO_MODE else looks[modes[owner].number].color for owner in owners]
     hierarchy.dendrogram(tree, ax=axes, no_labels=True, link_color_func=lambda node: colors[node])
     if (threshold := model.mode_settings.distance_threshold) is not None:
         axes.axhline(threshold, color="k", ls=":", label=f"cut at {threshold:g}")
     for index, mode in enumerate(modes):
         n_members = owners[: len(successes)].count(index)
-        axes.plot([], [], color=mode_color(mode.number), marker=mode_marker(mode.number), label=f"{mode.name} ({n_members})")
+        own = looks[mode.number]
+        axes.plot([], [], color=own.color, marker=own.marker, label=f"{mode.name} ({n_members})")
     axes.set(ylabel="DTW distance", xlabel=f"{len(successes)} goal-reached trajectories")
     figure.legend(loc="outside right upper")
     return figure
@@ -306,12 +311,13 @@ def plot_values(model: Any, observations: np.ndarray, maze: Any = None, normaliz
     figure, grid = panels(len(modes))
     limits = float(values.min()), float(values.max())
     image: Any = None
+    colors = colors_of(modes)
     for axes, mode, expected in zip(grid, modes, values.T, strict=True):
         image = draw_values(axes, positions, expected, maze, limits)
         if len(mode.representative):
             route = _in_plane(mode.representative)
             axes.plot(*route.T, color="w", lw=2.5, zorder=2)
-            axes.plot(*route.T, color=mode_color(mode.number), lw=1.5, zorder=2)
+            axes.plot(*route.T, color=colors[mode.name], lw=1.5, zorder=2)
         axes.set_title(mode.name)
     figure.colorbar(image, ax=grid, label="value of the mode (discounted, scaled reward)")
     return figure
@@ -338,7 +344,7 @@ def grid_observations(model: Any, observation: np.ndarray, maze: Any, spacing: f
 
 def plot_timeline(history: ModeHistory, end: int | None = None) -> Figure:
     """
-    When modes were born, split off, merged and ended.
+    When modes were born, split off, merged and ended. Those that have ended are grey.
 
     :param history: ``model.mode_history``
     :param end: Environment steps at the right edge; the latest event or state when None
@@ -350,12 +356,14 @@ def plot_timeline(history: ModeHistory, end: int | None = None) -> Figure:
     right_edge = last if end is None else end
     known = {life.number: life for life in lives(history)}
     rows = {number: row for row, number in enumerate(known)}
+    looks = styles(number for number, life in known.items() if life.end is None)
+    colors = {number: looks[number].color if number in looks else GREY for number in known}
     row_of_name = {life.name: rows[number] for number, life in known.items()}
     figure = _new(9, 1.2 + 0.28 * len(rows))
     axes = figure.subplots()
     for number, life in known.items():
         ends_at = right_edge if life.end is None else life.end
-        axes.plot([life.begin, ends_at], [rows[number]] * 2, color=mode_color(number), lw=4, solid_capstyle="butt")
+        axes.plot([life.begin, ends_at], [rows[number]] * 2, color=colors[number], lw=4, solid_capstyle="butt")
     for event in history:
         if event.number not in rows:
             continue
@@ -367,7 +375,7 @@ def plot_timeline(history: ModeHistory, end: int | None = None) -> Figure:
             axes.annotate("", (event.step, second), (event.step, first), arrowprops=arrow)
         marker = {"born": "o", "split from": "o", "merged into": "X", "retired": "X", "deleted": "X", "frozen": "*"}
         if event.kind in marker:
-            axes.plot(event.step, row, marker[event.kind], color=mode_color(event.number), mec="k", ms=7, zorder=3)
+            axes.plot(event.step, row, marker[event.kind], color=colors[event.number], mec="k", ms=7, zorder=3)
     axes.set_yticks(list(rows.values()), [life.name for life in known.values()])
     axes.invert_yaxis()
     _count_steps(axes)
@@ -388,15 +396,17 @@ def plot_success(history: ModeHistory, names: Mapping[int, str] | None = None) -
         return _empty("no re-clustering yet")
     figure = _new(9, 3.6)
     axes = figure.subplots()
-    for number in sorted({state.number for state in states}):
+    numbers = sorted({state.number for state in states})
+    looks = styles(numbers if names is None else names)
+    for number in numbers:
         own = [state for state in states if state.number == number]
         known = names is None or number in names
         axes.plot(
             [state.step for state in own],
             [state.success_rate for state in own],
-            color=mode_color(number) if known else "0.8",
+            color=looks[number].color if known else "0.8",
             lw=1.6 if known else 0.8,
-            marker=mode_marker(number) if known else None,
+            marker=looks[number].marker if known else None,
             markevery=max(1, len(own) // 8),
             ms=6,
             zorder=2 if known else 1,

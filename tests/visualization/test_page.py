@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_ddiffpg.visualization.page import Shown, as_json, render
-from sb3_ddiffpg.visualization.palette import COLORS, MARKERS, SHAPES, SYMBOLS, mode_color, mode_marker
+from sb3_ddiffpg.visualization.palette import COLORS, MARKERS, SHAPES, SYMBOLS, styles
 from sb3_ddiffpg.visualization.sketch import Course, Life, MazeSketch, ModeSketch, Sketch
 
 HOSTILE = "</script><img src=x onerror='window.hacked = 1'><b>bold</b>"
@@ -197,6 +197,8 @@ def test_two_side_by_side_and_on_a_phone(opened):
     boxes = "[...document.querySelectorAll('.panel')].map((each) => [each.offsetLeft, each.offsetTop])"
     (left, top), (right, level) = opened.run(boxes)
     assert right > left + 300 and level == top
+    fits = "[...document.querySelectorAll('.panel .main-svg')].every((each) => each.getBoundingClientRect().right <="
+    opened.until(f"{fits} each.closest('.panel').getBoundingClientRect().right)", 10)
     # An episode of one is not one of the other
     opened.run("document.querySelectorAll('.panel .episode input')[1].focus()")
     opened.press("ArrowRight")
@@ -262,7 +264,13 @@ def test_eight_colours_are_told_apart(seen):
     assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(seen_as, 2)) > 6 * 2.3
 
 
-def test_modes_differ_in_colour_or_marker():
-    looks = {(mode_color(number), mode_marker(number)) for number in range(72)}
-    assert len(looks) == 72 and len(COLORS) == 8 and len(MARKERS) == len(SYMBOLS) == len(SHAPES) == 9
-    assert len({mode_marker(number) for number in range(8)}) == 8
+@pytest.mark.parametrize("numbers", [range(72), [6, 9, 12, 13, 22, 26, 29, 30], range(0, 576, 8), range(0, 5184, 72)])
+def test_modes_are_told_apart_whatever_their_numbers(numbers):
+    """The second ones are those of a recorded run: by their numbers alone three were black, and two sky blue."""
+    looks = styles(numbers)
+    assert len({(look.color, look.marker) for look in looks.values()}) == len(numbers)
+    first = sorted(numbers)[:8]
+    assert len({looks[number].color for number in first}) == len({looks[number].marker for number in first}) == 8
+    # A mode that is born changes no other's
+    assert styles([*numbers, max(numbers) + 5]).items() >= looks.items()
+    assert len(COLORS) == 8 and len(MARKERS) == len(SYMBOLS) == len(SHAPES) == 9

@@ -28,7 +28,6 @@ from sb3_ddiffpg.report import main
 from sb3_ddiffpg.visualization.figures import CAPTIONS, draw_all
 from sb3_ddiffpg.visualization.plots import (
     grid_observations,
-    mode_color,
     plot_exploration,
     plot_routes,
     plot_success,
@@ -153,7 +152,7 @@ def test_all_pictures_there_are(run):
     assert list(draw_all(loaded, maze, observation)) == ["success", "timeline", "values", "exploration"]
     assert set(draw_all(small_model(DummyVecEnv([TwoEnds])))) == {"success", "timeline", "exploration"}
     titles = [axes.get_title() for axes in figures["values"].axes][: len(model.modes)]
-    assert titles == model.modes.names and mode_color(11) == mode_color(3)
+    assert titles == model.modes.names
 
 
 # ---------------------------------------------------------------------- during training

@@ -163,7 +163,7 @@ const charts = (() => {
     });
     const names = model.lives.map((life) => plain(life.name));
     const yaxis = {tickvals: names.map((_, row) => row), ticktext: names, range: [names.length - 0.5, -0.5]};
-    return {traces, layout: layout("environment steps", "", {yaxis, xaxis: {rangemode: "tozero"}})};
+    return {height: Math.max(320, 90 + 20 * names.length), traces, layout: layout("environment steps", "", {yaxis, xaxis: {rangemode: "tozero"}})};
   }
 
   const curve = (x, y, name, text) => ({x, y, type: "scatter", mode: "lines+markers", name, marker: {size: 5}, hovertemplate: `step %{x:,}: ${text}<extra></extra>`});

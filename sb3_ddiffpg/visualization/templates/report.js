@@ -2,7 +2,7 @@
 "use strict";
 
 (() => {
-  const OPTIONS = {displayModeBar: false, responsive: true, scrollZoom: false, doubleClick: false};
+  const OPTIONS = {displayModeBar: false, scrollZoom: false, doubleClick: false};
   const find = (selector, within = document) => within.querySelector(selector);
   const every = (selector, within = document) => [...within.querySelectorAll(selector)];
   const live = document.body.dataset.live === "yes";
@@ -12,13 +12,19 @@
 
   // ------------------------------------------------------------------ drawing
 
+  // A chart is as wide as its place, also when another panel takes half of it
+  const sizes = new ResizeObserver((changes) => changes.forEach(({target}) => target.data && target.offsetWidth && Plotly.Plots.resize(target)));
+
   function draw(element, chart, said) {
     element.hidden = !chart;
     const title = element.previousElementSibling;
     if (title?.tagName === "H4") title.hidden = !chart;
     if (!chart) return undefined;
     element.setAttribute("aria-label", said);
-    return Plotly.react(element, chart.traces, chart.layout, OPTIONS);
+    if (chart.height) element.style.height = `${chart.height}px`;
+    const drawn = Plotly.react(element, chart.traces, chart.layout, OPTIONS);
+    sizes.observe(element);
+    return drawn;
   }
 
   function parse(key) {
@@ -90,6 +96,7 @@
     find(".view", panel).hidden = model.components.length < 3;
     drawPaths(side);
     draw(find(".starts", panel), charts.starts(model, index), `Where episodes of ${name} began, and whether they reached the goal. ${mode.starts?.said ?? ""}`);
+    find(".told", panel).textContent = mode.starts?.said ?? "";
     draw(find(".values", panel), charts.values(model, index), `What the critics expect along an episode of ${name}`);
     draw(find(".history", panel), charts.history(model, index), `Success of ${name} in training`);
     const video = find("video", panel);
