@@ -266,10 +266,18 @@ def test_a_browser_opens_the_page_without_network(page, browser):
 
 
 def test_without_modes_there_is_a_page_too(tmp_path):
+    """Also beside another model, from which it is told by as much of its folder as that takes."""
     model = small_model(make_vec_env("PointMazeV1-v0", 2))
-    model.save(tmp_path / "model")
-    main([str(tmp_path / "model.zip"), "--output", str(tmp_path / "page.html"), "--episodes", "2", "--no-videos"])
-    assert "found no mode yet" in (tmp_path / "page.html").read_text()
+    paths = [tmp_path / name / "model.zip" for name in ("one", "two")]
+    for path in paths:
+        model.save(path)
+    page = tmp_path / "page.html"
+    main([str(paths[0]), "--compare", str(paths[1]), "--output", str(page), "--episodes", "2", "--no-videos"])
+    text = page.read_text()
+    assert (
+        text.count("found no mode yet") == 2 and "The modes of one/model.zip" in text and "The modes of two/model.zip" in text
+    )
+    assert f"--compare {paths[1]}" in text
 
 
 def test_what_cannot_be_shown(tmp_path):
@@ -279,6 +287,7 @@ def test_what_cannot_be_shown(tmp_path):
         ([], "env: not given, and the model does not remember"),
         (["--env", "Nowhere-v0"], "env: 'Nowhere-v0' is not registered"),
         (["--replay-buffer", str(tmp_path / "no.pkl")], "no.pkl does not exist"),
+        (["--compare", str(tmp_path / "no.zip")], "no.zip does not exist"),
         (["--episodes", "0"], "--episodes: 0 given"),
         (["--output", str(tmp_path)], "accepted is the path of a page"),
         (["--output", str(tmp_path / "page.json")], "accepted is the path of a page"),
