@@ -9,7 +9,13 @@ from sb3_ddiffpg.saving import _legacy
 
 if TYPE_CHECKING:
     from sb3_ddiffpg.buffers import ModeReplayBuffer
-    from sb3_ddiffpg.callbacks import ClusteringCallback, EvaluateModesCallback, ModeEvalCallback, ModeFigureCallback
+    from sb3_ddiffpg.callbacks import (
+        ClusteringCallback,
+        EvaluateModesCallback,
+        LiveCallback,
+        ModeEvalCallback,
+        ModeFigureCallback,
+    )
     from sb3_ddiffpg.check import EnvCheck, check_env
     from sb3_ddiffpg.ddiffpg import DDiffPG, DiffusionPolicy
     from sb3_ddiffpg.modes import Mode, ModeTable
@@ -22,6 +28,7 @@ __all__ = [
     "DiffusionPolicy",
     "EnvCheck",
     "EvaluateModesCallback",
+    "LiveCallback",
     "Mode",
     "ModeEvalCallback",
     "ModeFigureCallback",
@@ -36,7 +43,13 @@ __getattr__, __dir__, _ = lazy_loader.attach(
     ["buffers", "callbacks", "check", "clustering", "common", "ddiffpg", "evaluation", "exploration", "modes", "networks"],
     {
         "buffers": ["ModeReplayBuffer"],
-        "callbacks": ["ClusteringCallback", "EvaluateModesCallback", "ModeEvalCallback", "ModeFigureCallback"],
+        "callbacks": [
+            "ClusteringCallback",
+            "EvaluateModesCallback",
+            "LiveCallback",
+            "ModeEvalCallback",
+            "ModeFigureCallback",
+        ],
         "check": ["EnvCheck", "check_env"],
         "ddiffpg": ["DDiffPG", "DiffusionPolicy"],
         "modes": ["Mode", "ModeTable"],

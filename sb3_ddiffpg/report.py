@@ -27,10 +27,37 @@ def _command(given: argparse.Namespace, task: Task) -> str:
         ("--replay-buffer", given.replay_buffer),
         ("--vec-normalize", given.vec_normalize),
         ("--title", given.title),
+        ("--compare", given.compare),
     ):
         words += [] if value is None else [option, str(value)]
     words += ["--episodes", str(given.episodes), "--seed", str(given.seed), *(["--no-videos"] if given.no_videos else [])]
     return shlex.join(words)
+
+
+def _label(path: Path, other: Path | None) -> str:
+    """How a page calls a model: its file, with as much of its folder as tells it from the other one."""
+    if other is None:
+        return path.name
+    own, others = path.resolve().parts, other.resolve().parts
+    n = next((n for n in range(1, len(own) + 1) if own[-n:] != others[-n:]), 1)
+    return "/".join(own[-n:])
+
+
+def _compared(given: argparse.Namespace) -> tuple[str, DDiffPG, Task]:
+    """
+    The other model, in the environment that is named, else in its own.
+
+    :raises ValueError: If it cannot be shown there
+    """
+    model = DDiffPG.load(given.compare)
+    task = Task.of(model, given.env, dict(given.env_kwargs) if given.env else {})
+    task = replace(task, statistics=given.vec_normalize if model.is_normalized else None)
+    try:
+        task.check(model)
+    except ValueError as error:
+        raise ValueError(f"--compare: {error}") from None
+    name = _label(given.compare, given.model)
+    return name if name != _label(given.model, given.compare) else f"{name} again", model, task
 
 
 @contextmanager
@@ -76,8 +103,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--no-videos", action="store_true")
     parser.add_argument("--title")
+    parser.add_argument("--compare", type=Path, metavar="OTHER.zip", help="another model, which the page shows beside it")
     given = parser.parse_args(arguments)
-    for path in (given.model, given.replay_buffer, given.vec_normalize):
+    for path in (given.model, given.replay_buffer, given.vec_normalize, given.compare):
         if path is not None and not path.is_file():
             raise SystemExit(f"{path} does not exist")
     if given.episodes < 1:
@@ -92,10 +120,22 @@ def main(arguments: list[str] | None = None) -> None:
                 model.load_replay_buffer(given.replay_buffer)
             task = replace(Task.of(model, given.env, dict(given.env_kwargs)), statistics=given.vec_normalize)
             task.check(model)
+            compared = None if given.compare is None else _compared(given)
         except (OSError, ValueError) as error:
             raise SystemExit(str(error)) from error
         command = _command(given, task)
-        found = make_report(model, given.output, task, given.episodes, given.seed, not given.no_videos, given.title, command)
+        found = make_report(
+            model,
+            given.output,
+            task,
+            given.episodes,
+            given.seed,
+            not given.no_videos,
+            given.title,
+            command,
+            compared,
+            _label(given.model, given.compare),
+        )
     found.save(given.output.with_suffix(".json"))
     print(f"{found}\n\nwrote {given.output} and {given.output.with_suffix('.json')}")
 

@@ -13,7 +13,7 @@ from sb3_ddiffpg.visualization import plots
 CAPTIONS = {
     "routes": "The routes that each mode takes when it is commanded. Dashed: the goal was not reached.",
     "success": "Success of each mode in training, exploration noise included. Grey: modes that have ended.",
-    "timeline": "When modes were born, split off, merged and ended.",
+    "timeline": "When modes were born, split off, merged and ended. Grey: modes that have ended.",
     "values": "What each mode's critics expect from where, and the mode's central route.",
     "exploration": "Where training went, and how much of the space it knew when.",
     "dendrogram": "How alike the goal-reached trajectories are, and to which mode each belongs.",
@@ -39,7 +39,7 @@ def draw_all(
     names = {mode.number: mode.name for mode in modes}
     figures = {}
     if episodes:
-        figures["routes"] = plots.plot_routes(episodes, maze, plots.colors_of(modes))
+        figures["routes"] = plots.plot_routes(episodes, maze, plots.colors_of(modes), plots.markers_of(modes))
     figures["success"] = plots.plot_success(model.mode_history, names)
     figures["timeline"] = plots.plot_timeline(model.mode_history, model.lifetime_steps)
     places = _places(model, maze, observation)

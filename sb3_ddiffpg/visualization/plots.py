@@ -17,6 +17,8 @@ from sb3_ddiffpg.evaluation.rollout import EpisodeResult
 from sb3_ddiffpg.exploration.visit_map import VisitMap
 from sb3_ddiffpg.modes.history import ModeHistory
 from sb3_ddiffpg.modes.mode import Mode
+from sb3_ddiffpg.visualization.palette import GREY, styles
+from sb3_ddiffpg.visualization.sketch import lives
 
 # Share of the cells whose visits have a colour of their own; the rest, near the start, would outshine them
 _TOLD_APART = 0.95
@@ -26,20 +28,22 @@ MOST_STRETCHED = 5.0
 _OUTLINE = [withStroke(linewidth=2, foreground="w")]
 
 
-def mode_color(number: int) -> str:
-    """
-    :param number: A mode's number
-    :return: Its colour in all pictures
-    """
-    return f"C{number % 10}"
-
-
 def colors_of(modes: Sequence[Mode]) -> dict[str, str]:
     """
     :param modes: The modes of a model
     :return: Colour by name
     """
-    return {mode.name: mode_color(mode.number) for mode in modes}
+    looks = styles(mode.number for mode in modes)
+    return {mode.name: looks[mode.number].color for mode in modes}
+
+
+def markers_of(modes: Sequence[Mode]) -> dict[str, str]:
+    """
+    :param modes: The modes of a model
+    :return: Marker by name
+    """
+    looks = styles(mode.number for mode in modes)
+    return {mode.name: looks[mode.number].marker for mode in modes}
 
 
 def _new(width: float, height: float) -> Figure:
@@ -102,15 +106,19 @@ def _names(components: Sequence[int]) -> list[str]:
 
 
 def plot_routes(
-    episodes: Mapping[str, Sequence[EpisodeResult]], maze: Any = None, colors: Mapping[str, str] | None = None
+    episodes: Mapping[str, Sequence[EpisodeResult]],
+    maze: Any = None,
+    colors: Mapping[str, str] | None = None,
+    markers: Mapping[str, str] | None = None,
 ) -> Figure:
     """
-    The routes of some episodes, one colour for each name: in the plane, or, where the mode features have three components
-    (an arm), in space and seen from above and from the side. Failed episodes are dashed.
+    The routes of some episodes, one colour for each name and a marker at their ends: in the plane, or, where the mode features
+    have three components (an arm), in space and seen from above and from the side. Failed episodes are dashed.
 
     :param episodes: Episodes by name, usually the mode that was commanded
     :param maze: An ``envs.Maze`` whose walls, start and goals are drawn below
     :param colors: Colours by name
+    :param markers: Markers by name
     :return: The figure
     """
     if not any(len(runs) for runs in episodes.values()):
@@ -125,7 +133,7 @@ def plot_routes(
     else:
         views, components = [figure.subplots()], [[0, min(1, dim - 1)]]
     for axes, parts in zip(views, components, strict=True):
-        draw_routes(axes, episodes, maze, colors, parts)
+        draw_routes(axes, episodes, maze, colors, parts, markers)
         if len(parts) == 2:
             _label_axes(axes, maze, parts)
     figure.legend(*views[-1].get_legend_handles_labels(), loc="outside right upper")
@@ -138,24 +146,29 @@ def draw_routes(
     maze: Any = None,
     colors: Mapping[str, str] | None = None,
     components: Sequence[int] = (0, 1),
+    markers: Mapping[str, str] | None = None,
 ) -> None:
     """
-    The routes of some episodes, one colour and label for each name. Failed episodes are dashed.
+    The routes of some episodes, one colour, marker and label for each name. Failed episodes are dashed.
 
     :param axes: Where
     :param episodes: Episodes by name
     :param maze: An ``envs.Maze`` that is drawn below
     :param colors: Colours by name
     :param components: Of the mode features that are drawn
+    :param markers: Of the ends of the paths, by name
     """
     if maze is not None:
         _draw_maze(axes, maze)
+    looks = styles(range(len(episodes)))
     for number, (name, runs) in enumerate(episodes.items()):
-        color = (colors or {}).get(name, mode_color(number))
+        color = (colors or {}).get(name, looks[number].color)
+        marker = (markers or {}).get(name, looks[number].marker)
         for run in runs:
             style = "--" if run.success is False else "-"
-            axes.plot(*run.path[:, list(components)].T, style, color=color, alpha=0.35, lw=1)
-        axes.plot([], [], color=color, label=name)
+            path, end = run.path[:, list(components)].T, {"marker": marker, "markevery": [-1], "ms": 5}
+            axes.plot(*path, style, color=color, alpha=0.35, lw=1, **end)
+        axes.plot([], [], color=color, marker=marker, label=name)
 
 
 def plot_dendrogram(model: Any) -> Figure:
@@ -178,13 +191,15 @@ def plot_dendrogram(model: Any) -> Figure:
         owners.append(first if first == second else NO_MODE)
     figure = _new(9, 4)
     axes = figure.subplots()
-    colors = ["0.6" if owner == NO_MODE else mode_color(modes[owner].number) for owner in owners]
+    looks = styles(mode.number for mode in modes)
+    colors = ["0.6" if owner == NO_MODE else looks[modes[owner].number].color for owner in owners]
     hierarchy.dendrogram(tree, ax=axes, no_labels=True, link_color_func=lambda node: colors[node])
     if (threshold := model.mode_settings.distance_threshold) is not None:
         axes.axhline(threshold, color="k", ls=":", label=f"cut at {threshold:g}")
     for index, mode in enumerate(modes):
         n_members = owners[: len(successes)].count(index)
-        axes.plot([], [], color=mode_color(mode.number), label=f"{mode.name} ({n_members})")
+        own = looks[mode.number]
+        axes.plot([], [], color=own.color, marker=own.marker, label=f"{mode.name} ({n_members})")
     axes.set(ylabel="DTW distance", xlabel=f"{len(successes)} goal-reached trajectories")
     figure.legend(loc="outside right upper")
     return figure
@@ -296,12 +311,13 @@ def plot_values(model: Any, observations: np.ndarray, maze: Any = None, normaliz
     figure, grid = panels(len(modes))
     limits = float(values.min()), float(values.max())
     image: Any = None
+    colors = colors_of(modes)
     for axes, mode, expected in zip(grid, modes, values.T, strict=True):
         image = draw_values(axes, positions, expected, maze, limits)
         if len(mode.representative):
             route = _in_plane(mode.representative)
             axes.plot(*route.T, color="w", lw=2.5, zorder=2)
-            axes.plot(*route.T, color=mode_color(mode.number), lw=1.5, zorder=2)
+            axes.plot(*route.T, color=colors[mode.name], lw=1.5, zorder=2)
         axes.set_title(mode.name)
     figure.colorbar(image, ax=grid, label="value of the mode (discounted, scaled reward)")
     return figure
@@ -328,7 +344,7 @@ def grid_observations(model: Any, observation: np.ndarray, maze: Any, spacing: f
 
 def plot_timeline(history: ModeHistory, end: int | None = None) -> Figure:
     """
-    When modes were born, split off, merged and ended.
+    When modes were born, split off, merged and ended. Those that have ended are grey.
 
     :param history: ``model.mode_history``
     :param end: Environment steps at the right edge; the latest event or state when None
@@ -338,22 +354,16 @@ def plot_timeline(history: ModeHistory, end: int | None = None) -> Figure:
         return _empty("nothing has happened to a mode yet")
     last = max([event.step for event in history] + [state.step for state in history.states])
     right_edge = last if end is None else end
-    names = {event.number: event.other if event.kind == "renamed to" else event.name for event in history}
-    begins = {event.number: event.step for event in history if event.kind in ("born", "split from")}
-    ends = {event.number: event for event in history if event.kind in ("merged into", "retired", "deleted")}
-    rows = {number: row for row, number in enumerate(sorted(begins))}
-    row_of_name = {name: rows[number] for number, name in names.items() if number in rows}
+    known = {life.number: life for life in lives(history)}
+    rows = {number: row for row, number in enumerate(known)}
+    looks = styles(number for number, life in known.items() if life.end is None)
+    colors = {number: looks[number].color if number in looks else GREY for number in known}
+    row_of_name = {life.name: rows[number] for number, life in known.items()}
     figure = _new(9, 1.2 + 0.28 * len(rows))
     axes = figure.subplots()
-    for number, row in rows.items():
-        final = ends.get(number)
-        axes.plot(
-            [begins[number], final.step if final else right_edge],
-            [row, row],
-            color=mode_color(number),
-            lw=4,
-            solid_capstyle="butt",
-        )
+    for number, life in known.items():
+        ends_at = right_edge if life.end is None else life.end
+        axes.plot([life.begin, ends_at], [rows[number]] * 2, color=colors[number], lw=4, solid_capstyle="butt")
     for event in history:
         if event.number not in rows:
             continue
@@ -365,8 +375,8 @@ def plot_timeline(history: ModeHistory, end: int | None = None) -> Figure:
             axes.annotate("", (event.step, second), (event.step, first), arrowprops=arrow)
         marker = {"born": "o", "split from": "o", "merged into": "X", "retired": "X", "deleted": "X", "frozen": "*"}
         if event.kind in marker:
-            axes.plot(event.step, row, marker[event.kind], color=mode_color(event.number), mec="k", ms=7, zorder=3)
-    axes.set_yticks(list(rows.values()), [str(names[number]) for number in rows])
+            axes.plot(event.step, row, marker[event.kind], color=colors[event.number], mec="k", ms=7, zorder=3)
+    axes.set_yticks(list(rows.values()), [life.name for life in known.values()])
     axes.invert_yaxis()
     _count_steps(axes)
     axes.set(title="o born or split   x ended   * frozen")
@@ -386,14 +396,19 @@ def plot_success(history: ModeHistory, names: Mapping[int, str] | None = None) -
         return _empty("no re-clustering yet")
     figure = _new(9, 3.6)
     axes = figure.subplots()
-    for number in sorted({state.number for state in states}):
+    numbers = sorted({state.number for state in states})
+    looks = styles(numbers if names is None else names)
+    for number in numbers:
         own = [state for state in states if state.number == number]
         known = names is None or number in names
         axes.plot(
             [state.step for state in own],
             [state.success_rate for state in own],
-            color=mode_color(number) if known else "0.8",
+            color=looks[number].color if known else "0.8",
             lw=1.6 if known else 0.8,
+            marker=looks[number].marker if known else None,
+            markevery=max(1, len(own) // 8),
+            ms=6,
             zorder=2 if known else 1,
             label=(names or {}).get(number, f"mode_{number}") if known else None,
         )

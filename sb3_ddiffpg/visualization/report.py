@@ -1,59 +1,36 @@
-"""One page about a trained model, without network. Needs the extra ``plots``."""
+"""One page about a trained model, or about two side by side, without network. Needs the extra ``plots``."""
 
 import base64
-import inspect
 import io
 import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import imageio.v3 as imageio
-import jinja2
 import numpy as np
-from matplotlib.colors import to_hex
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
+from sb3_ddiffpg.envs import is_ours
 from sb3_ddiffpg.evaluation.evaluate import evaluate_modes
 from sb3_ddiffpg.evaluation.results import ModeEvaluation
+from sb3_ddiffpg.evaluation.rollout import EpisodeResult, run_episodes
 from sb3_ddiffpg.evaluation.task import Task
-from sb3_ddiffpg.utils.arguments import groups_of, settings_attribute
+from sb3_ddiffpg.utils.rng import preserved_rng
 from sb3_ddiffpg.utils.vec_envs import env_attribute
 from sb3_ddiffpg.utils.versions import versions
-from sb3_ddiffpg.visualization import figures, plots
+from sb3_ddiffpg.visualization import figures, tables
+from sb3_ddiffpg.visualization.page import Shown, render
+from sb3_ddiffpg.visualization.sketch import columns, sketch, thin
+from sb3_ddiffpg.visualization.walk import Walk, walk
 
-# Of an evaluation's episodes, so many are drawn for each mode
+# Of an evaluation's episodes, so many are drawn for each mode in the pictures; the charts have all
 _ROUTES_DRAWN = 20
-
-
-def film(model: Any, task: Task, mode: str | None, seed: int, max_frames: int = 400) -> tuple[np.ndarray, int]:
-    """
-    One episode in figures.
-
-    :param model: A trained model
-    :param task: Where
-    :param mode: The mode to command
-    :param seed: Of the environment
-    :param max_frames: The film ends after so many
-    :return: Frames, shape [T, height, width, 3], and frames in a second
-    :raises ValueError: If the environment draws no pictures
-    """
-    env = task.make(1, seed, render_mode="rgb_array")
-    observation, state = env.reset(), None
-    frames, done = [env.get_images()[0]], False
-    while not done and len(frames) < max_frames and isinstance(frames[0], np.ndarray):
-        action, state = model.predict(observation, state, mode=mode)
-        observation, _, dones, _ = env.step(action)
-        done = bool(dones[0])
-        if not done:  # then the next episode has begun
-            frames.append(env.get_images()[0])
-    metadata: Any = getattr(env, "metadata", None) or {}
-    rate = int(metadata.get("render_fps", 20))
-    env.close()
-    if not isinstance(frames[0], np.ndarray) or frames[0].ndim != 3:
-        raise ValueError(f"{task.id} gives no picture of shape [height, width, 3]")
-    height, width = (size - size % 2 for size in frames[0].shape[:2])  # what the codec wants
-    return np.stack(frames)[:, :height, :width], rate  # type: ignore[arg-type]
+# Episodes for each mode that begin elsewhere, and of one episode's values
+_STARTS, _VALUE_POINTS = 50, 150
 
 
 def make_report(
@@ -65,6 +42,8 @@ def make_report(
     videos: bool = True,
     title: str | None = None,
     command: str = "",
+    compared: tuple[str, Any, Task] | None = None,
+    label: str = "the model",
 ) -> ModeEvaluation:
     """
     Evaluate a model, draw it, and write a page of HTML that needs no other file and no network. Videos lie beside it too.
@@ -77,10 +56,28 @@ def make_report(
     :param videos: Whether to film an episode of each mode
     :param title: Of the page
     :param command: The command that makes this page
-    :return: The evaluation
+    :param compared: Another model that the page shows beside it: how it is called, itself, and where it is evaluated
+    :param label: How the page calls the model, where there is another one
+    :return: The evaluation of the model
     """
     output = Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)
+    found, shown = _show(model, task, label, output, "", n_episodes, seed, videos)
+    shown.reproduce = command
+    others = []
+    if compared is not None:
+        name, other, its_task = compared
+        others = [_show(other, its_task, name, output, "-compared", n_episodes, seed, videos)[1]]
+    made_with = ", ".join(f"{name} {number}" for name, number in versions().items())
+    page = render(title or f"Routes in {task.id}", [shown, *others], made_with)
+    output.write_text(page, encoding="utf-8")
+    return found
+
+
+def _show(
+    model: Any, task: Task, label: str, output: Path, suffix: str, n_episodes: int, seed: int, videos: bool
+) -> tuple[ModeEvaluation, Shown]:
+    """Evaluate a model, and say what a page shows of it."""
     env = task.make(min(n_episodes, 25), seed)
     found = evaluate_modes(model, env, n_episodes, seed=seed)
     first: Any = env.reset()
@@ -88,122 +85,112 @@ def make_report(
     normalizer = unwrap_vec_normalize(env)
     original: Any = first if normalizer is None else normalizer.get_original_obs()
     observation = None if isinstance(original, dict) else original[0]
-    drawn = {name: runs[:_ROUTES_DRAWN] for name, runs in found.episodes.items() if name != "(none)"}
+    commanded = {name: runs for name, runs in found.episodes.items() if name != "(none)"}
     values = model.mode_values(first)[0] if len(model.modes) else np.zeros(0)
     env.close()
-    films, no_films = _films(model, task, seed, output) if videos else ([], "")
-    template = jinja2.Environment(
-        loader=jinja2.PackageLoader("sb3_ddiffpg.visualization"), autoescape=True, undefined=jinja2.StrictUndefined
-    ).get_template("report.html")
-    page = template.render(
-        title=title or f"Routes in {task.id}",
-        subtitle=f"{len(model.modes)} modes after {model.num_timesteps:,} environment steps",
-        rows=_rows(model, found, values),
-        ways_note=_ways_note(found),
-        summary=_summary(found),
+    films, walks, no_films = _films(model, task, seed, output, suffix) if videos else ({}, {}, "")
+    for name in model.modes.names:
+        if name not in walks:
+            walks[name] = walk(model, task, name, seed, filmed=False)
+    starts = _starts(model, task, commanded, min(n_episodes, _STARTS), seed)
+    cells = tables.cells(model, found, values)
+    drawn = {name: runs[:_ROUTES_DRAWN] for name, runs in commanded.items()}
+    shown = Shown(
+        label=label,
+        subtitle=f"{len(model.modes)} modes in {task.id} after {model.num_timesteps:,} environment steps",
+        sketch=sketch(model, task.id, maze),
+        head=tables.HEAD,
+        cells=cells,
+        best=tables.best_mode(found),
+        note=tables.ways_note(found),
+        extra={
+            name: {
+                "episodes": _episodes(commanded[name]),
+                "starts": starts[name],
+                "values": _values(walks[name]),
+                "facts": f"Success {cells[name][1]} ({cells[name][2]} with 95 % confidence), {cells[name][3]} steps, return "
+                f"{cells[name][4]}, value at the start {cells[name][5]}. Routes: {cells[name][0]}.",
+            }
+            for name in model.modes.names
+        },
+        summary=tables.summary(found),
         evaluation=str(found),
         pictures=[
             {"name": name, "caption": figures.CAPTIONS[name], "data": _png(figure)}
             for name, figure in figures.draw_all(model, maze, observation, drawn, normalizer).items()
         ],
-        videos=films,
+        films=films,
         no_films=no_films,
         history=str(model.mode_history),
-        settings=_settings(model),
-        reproduce=command,
-        versions=", ".join(f"{name} {number}" for name, number in versions().items()),
+        settings=tables.settings(model),
     )
-    output.write_text(page, encoding="utf-8")
+    return found, shown
+
+
+def _episodes(runs: Sequence[EpisodeResult]) -> list[dict[str, Any]]:
+    return [
+        {
+            "ok": None if run.success is None else bool(run.success),
+            "length": run.length,
+            "ret": round(run.episode_return, 2),
+            "route": run.label,
+            "path": columns(run.path),
+        }
+        for run in runs
+    ]
+
+
+def _starts(
+    model: Any, task: Task, commanded: Mapping[str, Sequence[EpisodeResult]], n_episodes: int, seed: int
+) -> dict[str, dict[str, Any]]:
+    """Of a task of ours, whose evaluation has one start, further episodes from all over where training began."""
+    runs = dict(commanded)
+    if is_ours(task.id) and runs and task.kwargs.get("start_noise") == 0.0:
+        kwargs = {name: value for name, value in task.kwargs.items() if name != "start_noise"}
+        env = replace(task, kwargs=kwargs).make(min(n_episodes, 25), seed + 1)
+        with preserved_rng():
+            set_random_seed(seed + 1)
+            runs = {name: run_episodes(model, env, n_episodes, mode=name) for name in runs}
+        env.close()
+    found = {}
+    for name, episodes in runs.items():
+        began = np.stack([episode.path[0] for episode in episodes])
+        reached = sum(episode.success is not False for episode in episodes)
+        apart = float(np.linalg.norm(np.ptp(began, axis=0)))
+        x, y = [*columns(began, len(began)), [0.0] * len(began)][:2]
+        ok = [None if episode.success is None else bool(episode.success) for episode in episodes]
+        said = f"{reached} of {len(episodes)} reached the goal, from starts at most {apart:.3g} apart."
+        found[name] = {"x": x, "y": y, "ok": ok, "said": said}
     return found
 
 
-def _films(model: Any, task: Task, seed: int, output: Path) -> tuple[list[dict[str, str]], str]:
-    """A film of each mode, beside the page and for it; or why there is none."""
-    films = []
+def _values(seen: Walk) -> dict[str, Any]:
+    steps = thin(len(seen.values), _VALUE_POINTS)
+    return {"step": steps.tolist(), "value": [column.round(3).tolist() for column in seen.values[steps].T.astype(float)]}
+
+
+def _films(
+    model: Any, task: Task, seed: int, output: Path, suffix: str
+) -> tuple[dict[str, dict[str, Any]], dict[str, Walk], str]:
+    """A film of each mode, beside the page and for it, and the episodes in it; or why there is none."""
+    films, walks = {}, {}
     with TemporaryDirectory(dir=output.parent) as folder:
         for index, name in enumerate(model.modes.names):
-            path = Path(folder, f"{output.stem}-{index}-{re.sub(r'[^-a-zA-Z0-9_.]', '_', name)}.mp4")
+            path = Path(folder, f"{output.stem}{suffix}-{index}-{re.sub(r'[^-a-zA-Z0-9_.]', '_', name)}.mp4")
             try:
-                frames, rate = film(model, task, name, seed)
+                seen = walk(model, task, name, seed)
             except Exception as error:  # whatever an environment's drawing raises: a page without films is better than none
-                return [], f"No film could be made: {error}"
-            imageio.imwrite(path, frames, fps=rate, macro_block_size=2)
-            films.append({"name": name, "data": base64.b64encode(path.read_bytes()).decode()})
+                return {}, {}, f"No film could be made: {error}"
+            assert seen.frames is not None
+            imageio.imwrite(path, seen.frames, fps=seen.rate, macro_block_size=2)
+            films[name] = {"data": base64.b64encode(path.read_bytes()).decode(), "rate": seen.rate}
+            walks[name] = replace(seen, frames=None)
         for path in Path(folder).iterdir():
             path.replace(output.with_name(path.name))
-    return films, ""
+    return films, walks, ""
 
 
 def _png(figure: Any) -> str:
     with io.BytesIO() as file:
         figure.savefig(file, format="png", dpi=90)
         return base64.b64encode(file.getvalue()).decode()
-
-
-def _rows(model: Any, found: ModeEvaluation, values: np.ndarray) -> list[dict[str, Any]]:
-    by_name = {each.mode: each for each in found.commanded}
-    top = max((each.success_rate for each in found.commanded), default=0.0)
-    least = min((each.success_interval[0] for each in found.commanded if each.success_rate == top), default=0.0)
-    good = [each for each in found.commanded if each.n_successes and each.success_rate >= least]
-    best = min(good, key=lambda each: (-round(each.mean_return, 1), each.mean_length)).mode if good else None
-    rows = []
-    for mode, value in zip(model.modes, values, strict=True):
-        result = by_name[mode.name]
-        low, high = result.success_interval
-        rows.append(
-            {
-                "name": mode.name,
-                "color": to_hex(plots.mode_color(mode.number)),
-                "frozen": mode.frozen,
-                "best": mode.name == best,
-                "routes": ", ".join(f"{label} ({count})" for label, count in result.labels.items()) or "none",
-                "success": f"{result.success_rate:.0%}",
-                "interval": f"{low:.0%} to {high:.0%}",
-                "length": "-" if np.isnan(result.mean_length) else f"{result.mean_length:.0f}",
-                "episode_return": f"{result.mean_return:.2f}",
-                "value": f"{value:.2f}",
-                "born_at": f"{mode.born_at:,}",
-            }
-        )
-    return sorted(rows, key=lambda row: not row["best"])
-
-
-def _ways_note(found: ModeEvaluation) -> str:
-    if found.label_source == "clustering":
-        return "The environment does not say which route was taken: routes are clusters of these episodes' own paths."
-    return "Routes are told apart by the environment, not by the clustering that found the modes."
-
-
-def _summary(found: ModeEvaluation) -> list[tuple[str, str]]:
-    def percent(value: float) -> str:
-        return "-" if np.isnan(value) else f"{value:.1%}"
-
-    low, high = found.uncommanded.success_interval
-    return [
-        ("success without command", f"{found.uncommanded.success_rate:.1%} (95 %: {low:.1%} to {high:.1%})"),
-        ("routes expected in 20 episodes without command", f"{found.expected_modes():.2f}"),
-        ("routes taken in at least 5 % of them", str(found.robust_modes)),
-        ("effective number of routes", f"{found.effective_modes:.2f}"),
-        ("share of the task's listed routes", percent(found.coverage)),
-        ("commanded episodes that took their mode's own route", percent(found.control_accuracy)),
-        ("episodes start apart by at most", f"{found.start_spread:.3g}"),
-    ]
-
-
-def _settings(model: Any) -> list[tuple[str, str]]:
-    """Constructor arguments, and settings of groups, that differ from their defaults."""
-    settings, groups = [], groups_of(type(model))
-    for name, parameter in inspect.signature(type(model).__init__).parameters.items():
-        if name in groups:
-            chosen, usual = getattr(model, settings_attribute(name)).to_dict(), groups[name]().to_dict()
-            settings += [(f"{name}.{key}", repr(value)) for key, value in chosen.items() if value != usual[key]]
-            continue
-        value = getattr(model, name, None)
-        if name in ("self", "policy", "env", "device", "verbose", "tensorboard_log", "_init_setup_model", "action_noise"):
-            continue
-        if callable(value) or value is None or repr(value) == repr(parameter.default):
-            continue
-        shown = f"{value.frequency} {value.unit.value}" if name == "train_freq" else repr(value)
-        if name != "train_freq" or value.frequency != 1:
-            settings.append((name, shown))
-    return settings

@@ -1,4 +1,4 @@
-"""The zoo's scripts as commands of this package: train, enjoy, record_video. Beside them check."""
+"""The zoo's scripts as commands of this package: train, enjoy, record_video. Beside them check and watch."""
 
 import argparse
 import importlib.util
@@ -174,11 +174,25 @@ def record_video(arguments: Sequence[str]) -> None:
     _play(partial(runpy.run_module, "rl_zoo3.record_video", run_name="__main__"), arguments)
 
 
+def watch(arguments: Sequence[str]) -> None:
+    """
+    Serves a page on runs in progress, for this machine alone.
+
+    :param arguments: Command line, without the name of the program
+    """
+    try:
+        from sb3_ddiffpg.visualization.watch import main  # needs another extra
+    except ImportError as error:
+        raise SystemExit(f"watch needs the extra plots ({error}); install it with: pip install 'sb3_ddiffpg[plots]'") from None
+    main(arguments)
+
+
 COMMANDS: dict[str, Callable[[Sequence[str]], None]] = {
     "check": check,
     "train": train,
     "enjoy": enjoy,
     "record_video": record_video,
+    "watch": watch,
 }
 
 
@@ -189,7 +203,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="ddiffpg",
         description="DDiffPG in the RL zoo.",
-        epilog="check ENV says what DDiffPG makes of an environment. `ddiffpg COMMAND -h` lists the options, also the zoo's. "
+        epilog="check ENV says what DDiffPG makes of an environment, watch LOGDIR shows runs in progress. "
+        "`ddiffpg COMMAND -h` lists the options, also the zoo's. "
         "Beside them: train --n-envs N, "
         "--checkpoint-freq STEPS, --resume [FOLDER]; enjoy and record_video --mode M.",
     )

@@ -12,6 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from sb3_ddiffpg.callbacks.checkpoint import RunCheckpointCallback
+from sb3_ddiffpg.callbacks.live import LiveCallback
 from sb3_ddiffpg.common.schedules import LateLinearSchedule
 from sb3_ddiffpg.envs import is_ours, make_vec_env
 from sb3_ddiffpg.envs.description import wrappers_said
@@ -97,8 +98,10 @@ class ModeExperimentManager(ExperimentManager):
         return model
 
     def create_callbacks(self) -> None:
-        """The zoo's, and checkpoints of the whole run."""
+        """The zoo's, what ``ddiffpg watch`` reads, and checkpoints of the whole run."""
         super().create_callbacks()
+        if self.is_own and not self.optimize_hyperparameters:
+            self.callbacks.append(LiveCallback(self.save_path))
         if self.is_own and self.checkpoint_freq > 0 and not self.optimize_hyperparameters:
             folder = Path(self.save_path) / "checkpoints"
             self.callbacks.append(RunCheckpointCallback(folder, self.checkpoint_freq, verbose=self.verbose))

@@ -37,6 +37,7 @@ from sb3_ddiffpg.baselines import BASELINES
 from sb3_ddiffpg.envs import PointMazeVecEnv
 from sb3_ddiffpg.saving.checkpoint import checkpoint_files
 from sb3_ddiffpg.utils.arguments import settings_attribute
+from sb3_ddiffpg.visualization.runs import read_sketch
 from sb3_ddiffpg.zoo import ModeExperimentManager, check_hyperparameters, main, search
 from sb3_ddiffpg.zoo.settings import ZOO_KEYS
 
@@ -91,6 +92,7 @@ def train(folder, *options, **changes):
 
 def test_training_leaves_what_the_zoo_looks_for(logs, run):
     expected = {"best_model.zip", "evaluations.npz", "replay_buffer.pkl", f"{ENV}.zip"}
+    assert read_sketch(run / "live.json").env == ENV  # for those who watch it
     assert expected | {"rl_model_400_steps.zip", "rl_model_800_steps.zip"} <= {path.name for path in run.iterdir()}
     (events,) = (logs / "tb").rglob("events.out.tfevents*")
     tags = EventAccumulator(str(events)).Reload().Tags()["scalars"]
