@@ -12,6 +12,7 @@ from sb3_ddiffpg.clustering.linkage import cluster
 from sb3_ddiffpg.modes.discovery import find_modes, readmit_homeless, retired_modes, surpassed_modes
 from sb3_ddiffpg.modes.history import ModeEvent, ModeHistory, succeed
 from sb3_ddiffpg.modes.mode import (
+    TRIED_EPISODES,
     Mode,
     ModeTable,
     Outcome,
@@ -98,9 +99,11 @@ class ModeManager:
     def trusted(self) -> list[int]:
         """
         :return: Indices of the modes that a policy without command may follow: all that are not plainly worse than the best
+            and, if any was tried, that were tried
         """
         worse = outclassed(self.modes, self.success_is_told)
-        return [index for index in range(len(self)) if index not in worse]
+        tried = [len(mode.outcomes) >= TRIED_EPISODES for mode in self.modes]
+        return [index for index in range(len(self)) if index not in worse and (tried[index] or not any(tried))]
 
     # ------------------------------------------------------------------ finding
 

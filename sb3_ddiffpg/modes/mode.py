@@ -14,6 +14,8 @@ from sb3_ddiffpg.serialization.safetensors_tree import Count, check_array, conve
 #: Latest commanded episodes by which modes are compared, and what makes one worse than the best: the share of the pairs of an
 #: episode of each that it loses (ties count half), and how seldom that may be chance
 COMPARED_EPISODES, OUTCLASSED, CHANCE = 30, 0.75, 0.01
+#: Fewest commanded episodes that say something of a mode: two successes of five are plainly worse than 30 of 30
+TRIED_EPISODES = 5
 # A name stands in tables, legends, on command lines (where a number would be an index) and in tags of a log that cuts them
 ACCEPTED_NAME = re.compile(r"(?!_)(?=.*[^\W\d])[\w .+-]{1,24}")
 

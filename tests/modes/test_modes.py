@@ -71,6 +71,13 @@ def test_as_many_modes_as_observations(trained):
         trained.predict(some_observations(3), episode_start=np.ones(4, dtype=bool))
 
 
+@pytest.fixture
+def _all_are_drawn(monkeypatch):
+    """Also modes that a short training has hardly commanded."""
+    monkeypatch.setattr("sb3_ddiffpg.modes.manager.TRIED_EPISODES", 0)
+
+
+@pytest.mark.usefixtures("_all_are_drawn")
 def test_a_drawn_mode_is_kept_until_the_episode_ends(trained):
     np.random.seed(0)
     observations = some_observations(6)
@@ -106,7 +113,12 @@ def outcomes(scores):
         ([1] * 30, [0, 1] * 15, True, False),  # half as often: it loses half of the pairs and draws the others
         ([1] * 30, [0] * 18 + [1] * 12, True, True),
         ([1] * 3, [0] * 3, True, False),  # by chance alone in one of twenty such sixes
-        ([1] * 30, [], True, False),
+        ([1] * 30, [], True, True),  # nobody knows what it can do, and of the other one does
+        ([1] * 30, [1] * 4, True, True),
+        ([1] * 30, [1] * 5, True, False),
+        ([1] * 4, [], True, False),
+        ([1] * 30, [1, 1, 0, 0, 0], True, True),
+        ([1] * 30, [1, 1, 1, 0, 0], True, False),
         ([5] * 30, [3] * 30, True, False),  # whoever has never succeeded is no better for its returns
         ([5] * 30, [3] * 30, False, True),
         ([0, 5] * 15, [-1, 4] * 15, False, False),  # as -140 and -160 of a pendulum, of which each is 80 more or less
@@ -176,6 +188,7 @@ def test_the_policy_alone_knows_numbers(trained, mode):
         trained.policy.predict(some_observations(2), mode=mode)
 
 
+@pytest.mark.usefixtures("_all_are_drawn")
 def test_evaluation_with_sb3_draws_a_mode_for_each_episode(trained):
     held = []
 
