@@ -101,16 +101,17 @@ def test_density_is_capped_and_lies_where_the_visits_were():
     assert "no visit" in plot_exploration(None).axes[0].texts[0].get_text()
 
 
+# What happened to two modes, of which one goes on
+SPLIT_AND_MERGED = (
+    ModeEvent(10, "born", 0, "mode_0"),
+    ModeEvent(20, "split from", 1, "mode_1", "mode_0"),
+    ModeEvent(25, "renamed to", 0, "mode_0", "old road"),
+    ModeEvent(30, "merged into", 1, "mode_1", "old road"),
+)
+
+
 def test_timeline():
-    history = ModeHistory(
-        [
-            ModeEvent(10, "born", 0, "mode_0"),
-            ModeEvent(20, "split from", 1, "mode_1", "mode_0"),
-            ModeEvent(25, "renamed to", 0, "mode_0", "old road"),
-            ModeEvent(30, "merged into", 1, "mode_1", "old road"),
-            ModeEvent(40, "frozen", 0, "old road"),
-        ]
-    )
+    history = ModeHistory([*SPLIT_AND_MERGED, ModeEvent(40, "frozen", 0, "old road")])
     axes = plot_timeline(history, end=100).axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["old road", "mode_1"]
     assert [

@@ -13,9 +13,10 @@ import pytest
 from environments import TwoEnds, small_model
 from stable_baselines3.common.vec_env import DummyVecEnv
 from test_page import shown
+from test_report import SPLIT_AND_MERGED
 
 from sb3_ddiffpg import LiveCallback
-from sb3_ddiffpg.modes.history import ModeEvent, ModeHistory
+from sb3_ddiffpg.modes.history import ModeHistory
 from sb3_ddiffpg.visualization.runs import MOST_RUNS, read_runs, read_sketch
 from sb3_ddiffpg.visualization.sketch import CURVE_POINTS, PATH_POINTS, Life, columns, lives, sketch, thin
 from sb3_ddiffpg.visualization.watch import Watcher, main
@@ -44,15 +45,7 @@ def test_a_sketch_is_of_the_model(trained, tmp_path):
 
 
 def test_the_lives_of_modes():
-    history = ModeHistory(
-        [
-            ModeEvent(10, "born", 0, "mode_0"),
-            ModeEvent(20, "split from", 1, "mode_1", "mode_0"),
-            ModeEvent(25, "renamed to", 0, "mode_0", "old road"),
-            ModeEvent(30, "merged into", 1, "mode_1", "old road"),
-        ]
-    )
-    assert lives(history) == [
+    assert lives(ModeHistory([*SPLIT_AND_MERGED])) == [
         Life(0, "old road", 10, "born"),
         Life(1, "mode_1", 20, "split from mode_0", 30, "merged into old road"),
     ]
