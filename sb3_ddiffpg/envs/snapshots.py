@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_ddiffpg.envs.env_snapshots import Known, Snapshot, env_snapshot, match, peel, restore_env
 from sb3_ddiffpg.serialization.safetensors_tree import Count, check_array, convert
-from sb3_ddiffpg.utils.divergence import LARGEST
+from sb3_ddiffpg.utils.settings import LARGEST
 
 # What each known wrapper remembers, and of which type it is; another kind could remember anything
 _VEC_WRAPPERS: Known = {

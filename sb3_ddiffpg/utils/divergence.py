@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_ddiffpg.utils.settings import LARGEST
+
 # A loss this many times the square of the critics' support is an explosion: values a thousand supports away
 EXPLODED = 1e6
-#: Squares of smaller numbers, and sums of some, fit into 32 bits
-LARGEST = 1e18
 
 
 class DivergedError(ArithmeticError):

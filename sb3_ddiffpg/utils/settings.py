@@ -7,7 +7,8 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from sb3_ddiffpg.utils.divergence import LARGEST
+#: Squares of smaller numbers, and sums of some, fit into 32 bits
+LARGEST = 1e18
 
 
 @dataclass(frozen=True)

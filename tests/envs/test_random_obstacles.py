@@ -28,7 +28,15 @@ def reachable(rows, start, goal):
 def test_gap_cells_are_the_ways_past_the_islands():
     maze = Maze("V3")
     assert [tuple(maze.cell_center(cell)) for cell in maze.gap_cells] == GAPS
-    assert Maze("V1").gap_cells == [(1, 2), (3, 2)] and Maze("V2").gap_cells == []
+    assert Maze("V1").gap_cells == [(1, 2), (3, 2)]
+
+
+def test_without_islands_the_passages_are_where_a_single_goal_is_cut_off():
+    assert Maze("V2").gap_cells == [(3, 2), (3, 4)]  # the first steps to the west and to the east
+    # All goals hang on the first three cells, and that in the middle has none of its own: behind it is another
+    assert Maze(["########", "#r....g#", "####.###", "####.g.#", "######g#", "########"]).gap_cells == [(1, 5), (3, 6)]
+    assert Maze(["#####", "#r.g#", "#####"]).gap_cells == [(1, 2)]
+    assert Maze(["####", "#rg#", "####"]).gap_cells == []  # there is no cell between
 
 
 def test_every_draw_can_be_solved_and_each_comes():

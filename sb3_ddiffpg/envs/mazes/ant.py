@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -12,11 +12,12 @@ from gymnasium import spaces
 from gymnasium.envs.mujoco.mujoco_rendering import OffScreenViewer
 from mujoco.rollout import Rollout
 
-from sb3_ddiffpg.envs.mazes.ant_model import INTEGRATORS, ant_model
+from sb3_ddiffpg.envs.mazes.ant_model import INTEGRATORS, AntPhysics, ant_model
 from sb3_ddiffpg.envs.mazes.drawing import Image
 from sb3_ddiffpg.envs.mazes.env import MazeEnv, MazeVecEnv
 from sb3_ddiffpg.envs.mazes.maze import FloatArray, MazeMap
 from sb3_ddiffpg.envs.mazes.simulation import MazeSimulation
+from sb3_ddiffpg.envs.world_change import WorldChange
 from sb3_ddiffpg.utils.processors import n_processors
 
 #: Steps of the simulator in one step of the environment, which so takes 0.1 s.
@@ -49,11 +50,14 @@ class AntSimulation(MazeSimulation):
     :param ends_on_fall: whether an episode ends, without success, when the ant lies on its back, from where it does not get
         up: for training, which is spared the rest of it
     :param n_threads: threads that step the ants; None: one per processor this process may use, 0 for a single ant
+    :param changes: what is different in the world, a dict or a :class:`~sb3_ddiffpg.envs.WorldChange`
     :raises ValueError: if an argument is out of its range or the start box overlaps a wall
     """
 
     half_size = 0.9
     action_dim = 8
+    body = "an ant"
+    changeable = ("motor_strength", "friction", "gravity", "n_blocked")
 
     def __init__(
         self,
@@ -66,6 +70,7 @@ class AntSimulation(MazeSimulation):
         n_blocked: int = 0,
         ends_on_fall: bool = False,
         n_threads: int | None = None,
+        changes: WorldChange | Mapping[str, Any] | None = None,
     ) -> None:
         if integrator not in INTEGRATORS:
             raise ValueError(f"integrator: {integrator!r} given; accepted are {', '.join(map(repr, INTEGRATORS))}")
@@ -75,7 +80,7 @@ class AntSimulation(MazeSimulation):
             raise ValueError(f"n_threads: {n_threads} given; accepted are whole numbers from 0 up")
         if start_noise is None:
             start_noise = (1.0, 2.0) if isinstance(maze_map, str) and maze_map == "V1" else 0.0
-        super().__init__(n, maze_map, start_noise, goal_rewards, goal_radius, n_blocked)
+        super().__init__(n, maze_map, start_noise, goal_rewards, goal_radius, n_blocked, changes)
         self.integrator = integrator
         self.ends_on_fall = ends_on_fall
         self.n_threads = n_threads
@@ -91,7 +96,10 @@ class AntSimulation(MazeSimulation):
 
     def _model(self, i: int) -> mujoco.MjModel:
         blocked = self.blocked[i] if self.has_obstacles else None
-        return ant_model(self.maze.rows, self.goal_radius, self.integrator, blocked)
+        physics = AntPhysics(
+            self.changes.shares("motor_strength", self.action_dim), self.changes.friction, self.changes.gravity
+        )
+        return ant_model(self.maze.rows, self.goal_radius, self.integrator, blocked, physics)
 
     def __getstate__(self) -> dict[str, Any]:
         """Threads, their scratch memory and windows stay behind; models are compiled again."""

@@ -2,6 +2,7 @@
 
 from functools import lru_cache
 from importlib.resources import files
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -24,6 +25,16 @@ _UNDERGROUND = -10.0
 
 Cell = tuple[int, int]
 
+
+class AntPhysics(NamedTuple):
+    """Factors on each motor's torque, on the friction of all that touches, and on gravity."""
+
+    motors: tuple[float, ...] = (1.0,) * 8
+    friction: float = 1.0
+    gravity: float = 1.0
+
+
+_UNCHANGED = AntPhysics()
 
 def wall_boxes(walls: npt.NDArray[np.bool_]) -> list[tuple[Cell, Cell]]:
     """
@@ -52,7 +63,13 @@ def wall_boxes(walls: npt.NDArray[np.bool_]) -> list[tuple[Cell, Cell]]:
 
 
 @lru_cache(maxsize=64)
-def ant_model(rows: tuple[str, ...], goal_radius: float, integrator: str, blocked: tuple[Cell, ...] | None) -> mujoco.MjModel:
+def ant_model(
+    rows: tuple[str, ...],
+    goal_radius: float,
+    integrator: str,
+    blocked: tuple[Cell, ...] | None,
+    physics: AntPhysics = _UNCHANGED,
+) -> mujoco.MjModel:
     """
     Models are compiled once in a process and shared.
 
@@ -60,14 +77,16 @@ def ant_model(rows: tuple[str, ...], goal_radius: float, integrator: str, blocke
     :param goal_radius: in metres, for the picture
     :param integrator: one of ``INTEGRATORS``
     :param blocked: gap cells that are walled; None: this maze's obstacles never change, and need no boxes of their own
+    :param physics: what is different of the body and its world
     :return: the model, its sizes the same whichever cells are blocked
     """
     maze = Maze(rows)
     spec = mujoco.MjSpec.from_file(str(files("gymnasium.envs.mujoco") / "assets" / "ant.xml"))
     spec.option.timestep = TIMESTEP
     spec.option.integrator = INTEGRATORS[integrator]
-    for actuator in spec.actuators:
-        actuator.gear[0] = _GEAR
+    spec.option.gravity *= physics.gravity
+    for actuator, strength in zip(spec.actuators, physics.motors, strict=True):
+        actuator.gear[0] = _GEAR * strength
     spec.default.geom.solimp[:3] = _SOLIMP
     for geom in spec.geoms:
         geom.solimp[:3] = _SOLIMP
@@ -82,6 +101,8 @@ def ant_model(rows: tuple[str, ...], goal_radius: float, integrator: str, blocke
     for goal in maze.goals:
         _add_disc(spec, goal, goal_radius, (0.36, 0.72, 0.44, 1.0))
     _add_disc(spec, maze.start, 0.5, (0.4, 0.6, 0.9, 1.0))
+    for geom in spec.geoms:
+        geom.friction *= physics.friction
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 640, 640
     return spec.compile()
 

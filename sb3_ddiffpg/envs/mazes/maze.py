@@ -7,6 +7,7 @@ Positions are in metres, x to the right and y upwards. The centre of the start c
 import re
 from collections import deque
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -232,14 +233,44 @@ class Maze:
         """Labels of the routes the paper counts in this maze; empty for a map of one's own."""
         return LISTED_ROUTES.get(self.name or "", ())
 
-    @property
+    @cached_property
     def gap_cells(self) -> list[tuple[int, int]]:
-        """Open cells between two walls, one above and one below, in a column where an island has its cut: the ways past it."""
+        """
+        Passages. Beside islands: the open cells between two walls, one above and one below, in a column where an island has its
+        cut. In a maze without islands: the first cell on the way to each goal that leads to it alone.
+        """
+        if not self.cuts:
+            return self._own_cells()
         columns = {round((cut.x - self.extent[0]) / CELL_SIZE - 0.5) for cut in self.cuts}
         middle = np.zeros_like(self.walls)
         middle[1:-1] = self._reachable[1:-1] & ~self._reachable[:-2] & ~self._reachable[2:]
         taken = {self.start_cell, *self.goal_cells}
         return [cell for cell in _cells_where(middle) if cell[1] in columns and cell not in taken]
+
+    def _own_cells(self) -> list[tuple[int, int]]:
+        """Of each goal the cell nearest to the start without which it, and no other, is out of reach, in reading order."""
+        distances = cell_distances(~self.walls, self.start_cell)
+        taken = {self.start_cell, *self.goal_cells}
+        own = []
+        for goal in self.goal_cells:
+            # It lies on every way to the goal, so on this one
+            for cell in self._shortest_way(goal, distances):
+                free = ~self.walls
+                free[cell] = False
+                left = cell_distances(free, self.start_cell)
+                if cell not in taken and [other for other in self.goal_cells if left[other] < 0] == [goal]:
+                    own.append(cell)
+                    break
+        return sorted(own)
+
+    def _shortest_way(self, goal: tuple[int, int], distances: npt.NDArray[np.int64]) -> list[tuple[int, int]]:
+        """Cells from the start to a goal, given the steps from the start to each cell."""
+        way = [goal]
+        while distances[way[-1]] > 0:
+            i, j = way[-1]
+            # Walls and closed rooms are at -1, and the border is a wall: no neighbour is outside
+            way.append(next((i + di, j + dj) for di, dj in _SIDES if distances[i + di, j + dj] == distances[i, j] - 1))
+        return way[::-1]
 
     def cell_center(self, cell: tuple[int, int]) -> FloatArray:
         """

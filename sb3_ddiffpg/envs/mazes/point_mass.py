@@ -1,6 +1,6 @@
 """Point masses that slide along the walls of a maze, many moved by the same array operations."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from gymnasium import spaces
 from sb3_ddiffpg.envs.mazes.drawing import Image, draw_body
 from sb3_ddiffpg.envs.mazes.maze import CELL_SIZE, FloatArray, MazeMap
 from sb3_ddiffpg.envs.mazes.simulation import MazeSimulation
+from sb3_ddiffpg.envs.world_change import WorldChange
 
 #: Seconds per step.
 DT = 0.1
@@ -38,11 +39,14 @@ class PointSimulation(MazeSimulation):
     :param goal_radius: a goal is reached within this distance of its centre, in metres; at most half a cell
     :param max_speed: speed per axis that an action of 1 commands, in m/s; at most 20, half a cell per step
     :param n_blocked: gap cells that are walled in each episode, see :class:`MazeSimulation`
+    :param changes: what is different in the world, a dict or a :class:`~sb3_ddiffpg.envs.WorldChange`
     :raises ValueError: if an argument is out of its range or the start box overlaps a wall
     """
 
     half_size = HALF_SIZE
     action_dim = 2
+    body = "a point mass"
+    changeable = ("motor_strength", "friction", "n_blocked")
 
     def __init__(
         self,
@@ -53,13 +57,23 @@ class PointSimulation(MazeSimulation):
         goal_radius: float = 1.0,
         max_speed: float = 8.0,
         n_blocked: int = 0,
+        changes: WorldChange | Mapping[str, Any] | None = None,
     ) -> None:
         if start_noise is None:
             start_noise = _START_NOISE.get(maze_map, 0.5) if isinstance(maze_map, str) else 0.5
         if not 0 < max_speed <= CELL_SIZE / 2 / DT:
             raise ValueError(f"max_speed: {max_speed} given; accepted are numbers above 0, at most {CELL_SIZE / 2 / DT}")
-        super().__init__(n, maze_map, start_noise, goal_rewards, goal_radius, n_blocked)
+        super().__init__(n, maze_map, start_noise, goal_rewards, goal_radius, n_blocked, changes)
         self.max_speed = max_speed
+        lost = (1 - INERTIA) * self.changes.friction
+        if lost > 1:
+            raise ValueError(
+                f"changes.friction: {self.changes.friction} given; accepted of a point mass are 0 to {1 / (1 - INERTIA)}"
+            )
+        self._lasting = 1 - lost
+        strengths = np.array(self.changes.shares("motor_strength", 2))
+        # Velocity that an action of 1 adds in one step, per axis, shape (2, 1)
+        self._push = ((1 - INERTIA) * max_speed * strengths)[:, None]
         # Rows x, y, vx, vy: each contiguous.
         self._state = np.zeros((4, n))
         self._walls = np.tile(self.maze.walls.ravel(), (n, 1)) if self.has_obstacles else None
@@ -97,8 +111,10 @@ class PointSimulation(MazeSimulation):
 
     def _move(self, actions: npt.NDArray[Any]) -> None:
         position, velocity = self._state[:2], self._state[2:]
-        velocity *= INERTIA
-        velocity += (1 - INERTIA) * self.max_speed * actions.T
+        velocity *= self._lasting
+        velocity += self._push * actions.T
+        if self.changes.friction < 1:  # else it cannot become faster
+            velocity.clip(-self.max_speed, self.max_speed, out=velocity)
         for axis in (0, 1):
             target = [position[0], position[1]]
             target[axis] = position[axis] + velocity[axis] * DT

@@ -1,6 +1,6 @@
 """What all bodies in mazes have in common: starts, goals, obstacles that change, and the label of the route taken."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from math import comb
 from typing import Any, NamedTuple
@@ -13,6 +13,7 @@ from gymnasium import spaces
 from sb3_ddiffpg.envs.mazes.drawing import OBSTACLE, Image, draw_maze, fill_square
 from sb3_ddiffpg.envs.mazes.homotopy import HomotopyTracker
 from sb3_ddiffpg.envs.mazes.maze import CELL_SIZE, FloatArray, Maze, MazeMap, cell_distances
+from sb3_ddiffpg.envs.world_change import WorldChange
 from sb3_ddiffpg.serialization.safetensors_tree import check_array, convert
 
 Cell = tuple[int, int]
@@ -46,6 +47,7 @@ class MazeSimulation:
     :param goal_radius: a goal is reached within this distance of its centre, in metres; at most half a cell
     :param n_blocked: so many of the maze's gap cells (:attr:`Maze.gap_cells`) are walled in each episode, drawn anew such that
         every goal can still be reached
+    :param changes: what is different in the world, a dict or a :class:`~sb3_ddiffpg.envs.WorldChange`
     :raises ValueError: if an argument is out of its range or the start box overlaps a wall
     """
 
@@ -55,6 +57,9 @@ class MazeSimulation:
     _state: FloatArray
     #: Components of an action.
     action_dim: int
+    #: What a body is, in words, and what of it can be different, see :class:`~sb3_ddiffpg.envs.WorldChange`.
+    body: str
+    changeable: tuple[str, ...]
 
     def __init__(
         self,
@@ -64,8 +69,11 @@ class MazeSimulation:
         goal_rewards: Sequence[float] | None,
         goal_radius: float,
         n_blocked: int,
+        changes: WorldChange | Mapping[str, Any] | None,
     ) -> None:
         self.maze = Maze(maze_map)
+        self.changes = WorldChange.of(changes)
+        self.changes.check(f"{self.body} in a maze", self.changeable)
         if goal_rewards is None:
             goal_rewards = (2.0, 1.0) if self.maze.name == "V2" else (1.0,) * len(self.maze.goals)
         if np.shape(start_noise) not in ((), (2,)) or np.min(start_noise) < 0:
@@ -86,7 +94,10 @@ class MazeSimulation:
         self.goal_radius = goal_radius
         # One more entry for -1, "no goal".
         self.rewards = np.array([*goal_rewards, 0.0])
-        self._choices = [c for c in self._solvable_choices(n_blocked) if self._is_clear(c, self.maze.start, reach)]
+        every_goal = self.changes.n_blocked is None
+        n_blocked = n_blocked if self.changes.n_blocked is None else self.changes.n_blocked
+        solvable = self._solvable_choices(n_blocked, every_goal)
+        self._choices = [cells for cells in solvable if self._is_clear(cells, self.maze.start, reach)]
         if not self._choices:
             raise ValueError(f"n_blocked: {n_blocked} given, but wherever they are, they stand on the start")
         #: Whether gap cells can be walled
@@ -257,16 +268,20 @@ class MazeSimulation:
 
     # ------------------------------------------------------------------ obstacles
 
-    def _solvable_choices(self, n_blocked: int) -> list[tuple[Cell, ...]]:
-        """All sets of so many gap cells that leave a way to every goal."""
+    def _solvable_choices(self, n_blocked: int, every_goal: bool) -> list[tuple[Cell, ...]]:
+        """All sets of so many gap cells that leave a way to every goal, or to one."""
+        if n_blocked == 0:
+            return [()]
         gaps = self.maze.gap_cells
         if not 0 <= n_blocked <= len(gaps):
             raise ValueError(f"n_blocked: {n_blocked} given; accepted are 0 to {len(gaps)}, the gap cells of this maze")
         if comb(len(gaps), n_blocked) > _MOST_CHOICES:
             raise ValueError(f"n_blocked: {n_blocked} of {len(gaps)} gap cells are more than {_MOST_CHOICES} choices")
-        choices = [cells for cells in combinations(gaps, n_blocked) if len(self._reachable(cells)) == len(self.maze.goals)]
+        least = len(self.maze.goals) if every_goal else 1
+        choices = [cells for cells in combinations(gaps, n_blocked) if len(self._reachable(cells)) >= least]
         if not choices:
-            raise ValueError(f"n_blocked: {n_blocked} given, but wherever they are, a goal cannot be reached")
+            which = "a goal cannot" if every_goal else "no goal can"
+            raise ValueError(f"n_blocked: {n_blocked} given, but wherever they are, {which} be reached")
         return choices
 
     def _is_clear(self, blocked: tuple[Cell, ...], position: FloatArray, reach: FloatArray | float) -> bool:
