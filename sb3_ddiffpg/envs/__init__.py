@@ -12,8 +12,10 @@ import gymnasium as gym
 import lazy_loader
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
+from sb3_ddiffpg.envs.changed_env import ChangedEnv
 from sb3_ddiffpg.envs.mazes.homotopy import HomotopyTracker
 from sb3_ddiffpg.envs.mazes.maze import LISTED_ROUTES, MAZES, Maze, reduce_word
+from sb3_ddiffpg.envs.world_change import WorldChange
 from sb3_ddiffpg.envs.wrappers import HideGoal
 
 if TYPE_CHECKING:
@@ -24,11 +26,13 @@ if TYPE_CHECKING:
 __all__ = [
     "LISTED_ROUTES",
     "MAZES",
+    "ChangedEnv",
     "HideGoal",
     "HomotopyTracker",
     "Maze",
     "PointMazeEnv",
     "PointMazeVecEnv",
+    "WorldChange",
     "import_packages",
     "is_ours",
     "make_vec_env",

@@ -15,10 +15,17 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_ddiffpg.utils.settings import Settings
 from sb3_ddiffpg.utils.vec_envs import env_attribute
 
 # Of these modules a file may name wrappers; of others where the user has imported them
-_KNOWN_MODULES = ("gymnasium.wrappers", "stable_baselines3.common", "rl_zoo3.wrappers", "sb3_ddiffpg.envs.wrappers")
+_KNOWN_MODULES = (
+    "gymnasium.wrappers",
+    "stable_baselines3.common",
+    "rl_zoo3.wrappers",
+    "sb3_ddiffpg.envs.wrappers",
+    "sb3_ddiffpg.envs.changed_env",
+)
 # What only looks on; RecordVideo would write where a file tells it to
 _LOOKING_ON = ("Monitor", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering", "RenderCollection")
 
@@ -82,9 +89,16 @@ def _looks_on(entry_point: str) -> bool:
 
 def _json(value: Any) -> str | None:
     try:
-        return json.dumps(value)
+        return json.dumps(value, default=_plain)
     except (TypeError, ValueError):
         return None
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    """What stands for a value that JSON does not know, and is accepted in its place."""
+    if isinstance(value, Settings):
+        return value.to_dict()
+    raise TypeError(f"{value!r} is neither plain nor a group of settings")
 
 
 def _imported(entry_point: str) -> Any:

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 from gymnasium import wrappers
 
+from sb3_ddiffpg.envs.changed_env import ChangedEnv
 from sb3_ddiffpg.serialization.safetensors_tree import Count, check_array, convert
 
 #: What each known wrapper remembers of an episode, and of which type it is; another kind could remember anything
@@ -24,6 +25,7 @@ def _known_wrappers() -> Known:
         _plain(wrappers.TimeLimit): {"_elapsed_steps": Count | None},
         wrappers.OrderEnforcing: {"_has_reset": bool},
         wrappers.PassiveEnvChecker: {},
+        ChangedEnv: {"drawn_from": dict[str, Any] | None},
     }
     monitors = sys.modules.get("stable_baselines3.common.monitor")  # where it was not imported, none is one
     return known if monitors is None else {**known, monitors.Monitor: {"rewards": list[float], "needs_reset": bool}}

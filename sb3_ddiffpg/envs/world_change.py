@@ -25,8 +25,7 @@ def _are_shares(value: Any) -> bool:
 
 
 def _is_obstacle(value: Any) -> bool:
-    center, edges = value[:3], value[3:]
-    return len(edges) == 3 and all(is_number(each) and isfinite(each) for each in value) and len(center) == 3 and min(edges) > 0
+    return len(value) == 6 and all(is_number(each) and isfinite(each) for each in value) and min(value[3:]) > 0
 
 
 _SHARES = Accepted("be a share in [0, 1], or a dict of such shares by the numbers (from 0) of motors or joints", _are_shares)

@@ -20,12 +20,16 @@ except ImportError as error:
         f"The Franka tasks need pybullet ({error}). It has wheels up to Python 3.11: pip install 'sb3_ddiffpg[franka]'"
     ) from error
 
+from sb3_ddiffpg.envs.world_change import WorldChange
+
 FloatArray = npt.NDArray[np.float64]
 
 #: Seconds of one step of the simulator, and how many make a step of the environment (0.04 s).
 TIMESTEP, N_SUBSTEPS = 1 / 500, 20
 #: Largest change of a joint's target in one step, in rad.
 MAX_TURN = 0.05
+#: In m/s².
+GRAVITY = -9.81
 
 _FORCES = (87.0, 87.0, 87.0, 87.0, 12.0, 120.0, 120.0)
 _FINGERS, _FINGER_OPENING = (9, 10), 0.015
@@ -59,15 +63,36 @@ class PandaArm:
         with _silent_stdout():
             self.client = BulletClient(pybullet.DIRECT)
         self.client.setTimeStep(TIMESTEP)
-        self.client.setGravity(0.0, 0.0, -9.81)
+        self.client.setGravity(0.0, 0.0, GRAVITY)
         self._flags = 0 if with_visuals else pybullet.URDF_IGNORE_VISUAL_SHAPES
         text = (_ARM_FOLDER / "panda.urdf").read_text()
         text = text.replace("package://", f"{_ARM_FOLDER}/").replace("</robot>", f"{extra_links}</robot>")
         self.body = self.load(text, (base_x, 0.0, 0.0))
         self._forces = [force_scale * force for force in _FORCES]
         limits = [self.client.getJointInfo(self.body, joint)[8:10] for joint in range(7)]
-        self.low, self.high = np.array(limits).T
+        self.low, self.high = np.array(limits).T.copy()
         self.targets = np.zeros(7)
+
+    def change(self, changes: WorldChange, start: FloatArray) -> None:
+        """
+        Change motors, joints, friction and gravity.
+
+        :param changes: what is different
+        :param start: angles around which a joint keeps part of its range, in rad, shape (7,)
+        """
+        strengths, ranges = changes.shares("motor_strength", 7), changes.shares("joint_range", 7)
+        self._forces = [strength * force for strength, force in zip(strengths, self._forces, strict=True)]
+        self.client.setGravity(0.0, 0.0, changes.gravity * GRAVITY)
+        for joint, share in enumerate(ranges):
+            if share < 1:
+                self.low[joint] = start[joint] + share * (self.low[joint] - start[joint])
+                self.high[joint] = start[joint] + share * (self.high[joint] - start[joint])
+                limits = {"jointLowerLimit": self.low[joint], "jointUpperLimit": self.high[joint]}
+                self.client.changeDynamics(self.body, joint, **limits)
+        if changes.friction != 1:
+            for link in range(-1, self.client.getNumJoints(self.body)):
+                own = self.client.getDynamicsInfo(self.body, link)[1]
+                self.client.changeDynamics(self.body, link, lateralFriction=changes.friction * own)
 
     def load(self, urdf: str, position: Sequence[float]) -> int:
         """

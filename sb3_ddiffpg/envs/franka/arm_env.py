@@ -1,5 +1,6 @@
 """An arm with a task, as gymnasium wants it."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -9,12 +10,15 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_ddiffpg.envs.franka.arm import FloatArray, PandaArm
-from sb3_ddiffpg.envs.franka.bodies import Color, Triple, box
+from sb3_ddiffpg.envs.franka.bodies import OBSTACLE, Color, Triple, box
+from sb3_ddiffpg.envs.world_change import WorldChange
 from sb3_ddiffpg.serialization.random_states import restore_generator
 from sb3_ddiffpg.serialization.safetensors_tree import check_array, convert
 
 Image = npt.NDArray[np.uint8]
 
+# Deeper, in metres, an arm is flung out of what it begins in
+_TOUCH = 1e-3
 _METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}
 
 
@@ -34,6 +38,8 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
     :param render_mode: None or ``"rgb_array"``
     :param obs_joints: whether the seven joint angles are observed too
     :param start_noise: largest deviation of each joint's angle at the start, in rad; the task's own when None
+    :param changes: what is different in the world, a dict or a :class:`~sb3_ddiffpg.envs.WorldChange`
+    :raises ValueError: if an argument is out of its range, or an obstacle stands where the arm begins
     """
 
     metadata = _METADATA
@@ -47,6 +53,8 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
     cell_size: ClassVar[float] = 0.05
     #: The routes by which it can be done
     listed_modes: ClassVar[tuple[str, ...]]
+    #: Those that can be closed
+    closable: ClassVar[tuple[str, ...]] = ()
     force_scale: ClassVar[float] = 1.0
     tool: ClassVar[str] = ""
     #: What stands in the middle of a picture
@@ -54,7 +62,13 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
     #: Number of values that the task adds to the observation
     n_extra: ClassVar[int] = 0
 
-    def __init__(self, render_mode: str | None = None, obs_joints: bool = False, start_noise: float | None = None) -> None:
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        obs_joints: bool = False,
+        start_noise: float | None = None,
+        changes: WorldChange | Mapping[str, Any] | None = None,
+    ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode: {render_mode!r} given; accepted are None and 'rgb_array'")
         self.render_mode = render_mode
@@ -62,6 +76,8 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         self.start_noise = self.default_start_noise if start_noise is None else start_noise
         if not 0 <= self.start_noise <= np.pi:
             raise ValueError(f"start_noise: {start_noise} given; accepted are 0 to pi rad, and None")
+        self.changes = WorldChange.of(changes)
+        self._check_changes()
         self.mode_features = np.array(self.feature_indices)
         self.novelty_cell_size = self.cell_size
         size = 6 + self.n_extra + 7 * obs_joints
@@ -72,10 +88,25 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         self._actions: list[FloatArray] = []
         self._make_world()
 
+    def _check_changes(self) -> None:
+        possible = ["motor_strength", "friction", "gravity", "joint_range", "obstacle"]
+        self.changes.check(f"{type(self).__name__}'s arm", [*possible, "closed"] if self.closable else possible)
+        closed = set(self.changes.closed)
+        if not closed <= set(self.closable) or (closed and closed == set(self.closable)):
+            raise ValueError(f"changes.closed: {sorted(closed)} given; accepted are some of {self.closable}, but not all")
+
     def _make_world(self) -> None:
         self.arm = PandaArm(self.base_x, self.render_mode is not None, self.force_scale, self.tool)
+        start = np.array(self.start_angles)
+        self.arm.change(self.changes, start)
         self._build()
-        self.arm.reset(np.array(self.start_angles))
+        self.arm.reset(start)
+        if self.changes.obstacle is not None:
+            x, y, z, *edges = self.changes.obstacle
+            self._add_box((x, y, z), (edges[0], edges[1], edges[2]), OBSTACLE)
+            if self.arm.penetration() > _TOUCH:
+                self.arm.close()
+                raise ValueError(f"changes.obstacle: {self.changes.obstacle} given, but the arm begins there")
         # Contacts of an earlier episode must not reach into the next
         self._fresh = self.arm.client.saveState()
 
@@ -130,7 +161,7 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         for _ in range(100):  # a start within something else would be flung out of it
             noise = self.start_noise * self.np_random.uniform(-1.0, 1.0, 7)
             self._start_episode(np.clip(np.array(self.start_angles) + noise, self.arm.low, self.arm.high))
-            if self.arm.penetration() < 1e-3:
+            if self.arm.penetration() < _TOUCH:
                 break
         return self._observation(), {}
 

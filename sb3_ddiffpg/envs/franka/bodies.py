@@ -5,6 +5,7 @@ Color = tuple[float, float, float, float]
 
 #: Red, green, blue and opacity
 WOOD, STEEL, GOAL = (0.76, 0.6, 0.42, 1.0), (0.45, 0.5, 0.56, 1.0), (0.36, 0.72, 0.44, 0.6)
+OBSTACLE = (0.59, 0.41, 0.26, 1.0)
 
 
 def link(name: str, size: Triple, center: Triple, color: Color) -> str:

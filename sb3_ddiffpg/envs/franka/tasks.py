@@ -55,7 +55,7 @@ class FrankaPegInHole(FrankaEnv):
     Done is when the peg's tip is within the hole's half-width of its axis, and below the block's top.
     """
 
-    listed_modes = ("left", "right")
+    listed_modes = closable = ("left", "right")
     base_x = -0.6
     start_angles = (0.0, 0.41, 0.0, -1.85, 0.0, 2.26, 0.79)
     default_start_noise = 0.1
@@ -76,7 +76,9 @@ class FrankaPegInHole(FrankaEnv):
         self._add_box((0.0, 0.0, -0.025), (0.8, 1.0, 0.05), WOOD)
         inner, outer = self.HALF_WIDTH, 0.06
         wall = outer - inner
-        for x, y in self.HOLES.values():
+        for name, (x, y) in self.HOLES.items():
+            if name in self.changes.closed:
+                self._add_box((x, y, self.TOP / 2), (2 * inner, 2 * inner, self.TOP), STEEL)
             for side in (-1, 1):
                 self._add_box((x + side * (inner + wall / 2), y, self.TOP / 2), (wall, 2 * outer, self.TOP), STEEL)
                 self._add_box((x, y + side * (inner + wall / 2), self.TOP / 2), (2 * inner, wall, self.TOP), STEEL)
@@ -101,7 +103,7 @@ class FrankaDrawerClose(FrankaEnv):
     (left: positive y). The four openings (m) are observed, and are where routes differ: any part of the arm may push a drawer.
     """
 
-    listed_modes = QUARTERS
+    listed_modes = closable = QUARTERS
     feature_indices = (6, 7, 8, 9)
     cell_size = 0.01
     base_x = -1.2
@@ -115,7 +117,7 @@ class FrankaDrawerClose(FrankaEnv):
         for level, z in (("up", 0.68), ("down", 0.48))
     }
     SIZE = (0.3, 0.33, 0.16)
-    OPENING, CLOSED, BRAKE = 0.17, 0.03, 2.0
+    OPENING, CLOSED, BRAKE, STUCK = 0.17, 0.03, 2.0, 1e4
 
     def _build(self) -> None:
         # The back wall carries the drawers
@@ -124,8 +126,8 @@ class FrankaDrawerClose(FrankaEnv):
             parts.append(link(name, self.SIZE, (0.0, 0.0, 0.0), STEEL))
             parts.append(joint("prismatic", name, (-1.0, 0.0, 0.0), (x + 0.17, y, z - 0.58), 0.2))
         self._chest = self.arm.load(f"<robot name='chest'>{''.join(parts)}</robot>", (-0.17, 0.0, 0.58))
-        for drawer in range(4):
-            self._brake(self._chest, drawer, self.BRAKE)
+        for drawer, name in enumerate(self.DRAWERS):
+            self._brake(self._chest, drawer, self.STUCK if name in self.changes.closed else self.BRAKE)
 
     def _begin(self) -> None:
         for drawer in range(4):

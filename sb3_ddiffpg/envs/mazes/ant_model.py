@@ -36,6 +36,7 @@ class AntPhysics(NamedTuple):
 
 _UNCHANGED = AntPhysics()
 
+
 def wall_boxes(walls: npt.NDArray[np.bool_]) -> list[tuple[Cell, Cell]]:
     """
     Few rectangles that together are the walls: a simulator checks each pair of body and box.

@@ -236,8 +236,8 @@ class Maze:
     @cached_property
     def gap_cells(self) -> list[tuple[int, int]]:
         """
-        Passages. Beside islands: the open cells between two walls, one above and one below, in a column where an island has its
-        cut. In a maze without islands: the first cell on the way to each goal that leads to it alone.
+        Passages. Beside islands: the open cells between two walls, one above and one below, in a column where an island has
+        its cut. In a maze without islands: of each goal the first cell on the way that leads to it alone.
         """
         if not self.cuts:
             return self._own_cells()
