@@ -91,6 +91,8 @@ class FrankaEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
     def _check_changes(self) -> None:
         possible = ["motor_strength", "friction", "gravity", "joint_range", "obstacle"]
         self.changes.check(f"{type(self).__name__}'s arm", [*possible, "closed"] if self.closable else possible)
+        for name in ("motor_strength", "joint_range"):
+            self.changes.shares(name, 7)
         closed = set(self.changes.closed)
         if not closed <= set(self.closable) or (closed and closed == set(self.closable)):
             raise ValueError(f"changes.closed: {sorted(closed)} given; accepted are some of {self.closable}, but not all")
