@@ -13,6 +13,7 @@ from scipy.cluster import hierarchy
 from scipy.spatial.distance import squareform
 
 from sb3_ddiffpg.buffers.trajectory import NO_MODE
+from sb3_ddiffpg.evaluation.robustness import RobustnessCurve
 from sb3_ddiffpg.evaluation.rollout import EpisodeResult
 from sb3_ddiffpg.exploration.visit_map import VisitMap
 from sb3_ddiffpg.modes.history import ModeHistory
@@ -416,4 +417,25 @@ def plot_success(history: ModeHistory, names: Mapping[int, str] | None = None) -
     axes.set(ylabel="success of commanded episodes", ylim=(-0.03, 1.03))
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside right upper")
+    return figure
+
+
+def plot_robustness(curve: RobustnessCurve, change: str = "changed to") -> Figure:
+    """
+    Draw each mode's success, and that without command, over the values of a change of the world.
+
+    :param curve: What ``robustness_curve`` found
+    :param change: What is changed, the name of the axis
+    :return: The figure
+    """
+    figure = _new(7, 3.6)
+    axes = figure.subplots()
+    numbers = all(not isinstance(value, str) for value in curve.values)
+    values: Any = curve.values if numbers else list(map(str, curve.values))
+    looks = styles(range(len(curve.modes)))
+    for number, (name, success) in enumerate(curve.success.items()):
+        axes.plot(values, success, color=looks[number].color, marker=looks[number].marker, lw=1.6, ms=6, label=name)
+    axes.plot(values, curve.uncommanded_success, color=GREY, ls="--", label="no command")
+    axes.set(xlabel=change, ylabel="success", ylim=(-0.03, 1.03))
+    figure.legend(loc="outside right upper")
     return figure
