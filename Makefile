@@ -82,7 +82,7 @@ clean:
 
 # the pages' notebooks are run by the Python that has the package
 .venv-docs/.kernel: .venv-docs/.installed .venv/.installed-dev
-	$(BIN)/python -m ipykernel install --prefix .venv-docs --name python3 > /dev/null
+	JUPYTER_PATH=$(CURDIR)/.venv-docs/share/jupyter $(BIN)/python -m ipykernel install --prefix .venv-docs --name python3 > /dev/null
 	touch $@
 
 .venv:
