@@ -13,6 +13,7 @@ from sb3_ddiffpg.buffers.batch import ModeBatch
 from sb3_ddiffpg.buffers.mode_buffer import ModeReplayBuffer
 from sb3_ddiffpg.buffers.trajectory import Trajectory
 from sb3_ddiffpg.common.actor_critic import ActorCriticAlgorithm, Metrics
+from sb3_ddiffpg.exploration.known_regions import NO_ROUTE
 from sb3_ddiffpg.networks.policies import Actor, TwinCriticPolicy, average_networks
 from sb3_ddiffpg.serialization.codec import registered
 from sb3_ddiffpg.utils.settings import SHARE, Accepted
@@ -23,7 +24,11 @@ class FifoReplayBuffer(ModeReplayBuffer):
     """A ``ModeReplayBuffer`` without modes and target actions: the trajectory that ended first is the first to go."""
 
     target_action_fields: tuple[str, ...] = ()
-    relabels_goals = False
+    has_modes = False
+    constant_notes: ClassVar[dict[str, Any]] = {
+        **{"off_mode_success": False, "off_route": False, "route_novelty": 0.0},
+        **{"followed": NO_ROUTE, "counted": True},
+    }
 
     def _insert(self, trajectory: Trajectory) -> None:
         self.groups.retired.append(trajectory)

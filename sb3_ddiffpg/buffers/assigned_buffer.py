@@ -33,8 +33,8 @@ class AssignedReplayBuffer(PathReplayBuffer):
 
     #: Stored beside each action, for algorithms that improve them: of the mode that owns it, and of the exploratory group
     target_action_fields: tuple[str, ...] = ("target_actions", "exploratory_target_actions")
-    #: Whether trajectories are told of other goals, for algorithms that have modes
-    relabels_goals: bool = True
+    #: Whether the algorithm has modes; only then are their notes stored, and trajectories told of other goals
+    has_modes: bool = True
     target_actions: Any
     exploratory_target_actions: Any
     off_mode_success: np.ndarray
@@ -86,7 +86,7 @@ class AssignedReplayBuffer(PathReplayBuffer):
         :param env: The environments
         """
         super().claim(env)
-        self.hindsight = Hindsight.of(env) if self.relabels_goals else None
+        self.hindsight = Hindsight.of(env) if self.has_modes else None
         if self.hindsight is not None:
             self.hindsight.judge(self)
 
@@ -115,9 +115,10 @@ class AssignedReplayBuffer(PathReplayBuffer):
         action = ((self.action_dim,), np.float32)
         return {**super()._step_fields(), **dict.fromkeys(self.target_action_fields, action)}
 
-    def _note_fields(self) -> Fields:
+    def note_fields(self) -> Fields:
+        """See ``RowReplayBuffer``."""
         own: Fields = {"off_mode_success": ((), bool), "off_route": ((), bool), "route_novelty": ((), np.float32)}
-        return {**super()._note_fields(), **own, "goals": ((), bool)}
+        return {**super().note_fields(), **own, "goals": ((), bool)}
 
     @property
     def storage_bytes(self) -> int:
@@ -126,7 +127,7 @@ class AssignedReplayBuffer(PathReplayBuffer):
 
     def _allocate(self) -> None:
         super()._allocate()
-        self._mode_position = np.zeros(self.buffer_size, dtype=np.int32)
+        self._mode_position = np.zeros(self.buffer_size if self.has_modes else 0, dtype=np.int32)
         for row_set in self.mode_rows:
             row_set.position = self._mode_position
 
@@ -145,8 +146,10 @@ class AssignedReplayBuffer(PathReplayBuffer):
         super()._write_rows(rows, obs, next_obs, action, *args)
         for name in self.target_action_fields:
             self.steps.write(name, rows, action)
-        self.off_mode_success[rows] = self.off_route[rows] = self.goals[rows] = False
-        self.route_novelty[rows] = 0.0
+        self.goals[rows] = False
+        if self.has_modes:
+            self.off_mode_success[rows] = self.off_route[rows] = False
+            self.route_novelty[rows] = 0.0
 
     def _store(self, env: int, info: dict[str, Any]) -> Trajectory:
         trajectory = super()._store(env, info)
@@ -169,7 +172,8 @@ class AssignedReplayBuffer(PathReplayBuffer):
         self.unfounded_modes.update(each.mode for each in taken if each.mode != NO_MODE)
         super()._take_back_successes()
         self.goals[:] = False
-        self.route_novelty[:] = 0.0
+        if self.has_modes:
+            self.route_novelty[:] = 0.0
         self.new_route_rows = self.new_route_rows[:0]
 
     def _evict(self) -> Trajectory:

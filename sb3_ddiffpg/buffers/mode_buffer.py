@@ -141,7 +141,7 @@ class ModeReplayBuffer(AssignedReplayBuffer):
             rows[EXPLORATORY_GROUP, :n_new] = np.random.choice(self.new_route_rows, n_new)
         exploration_n_steps, mode_n_steps = (max(each, self.action_chunk) for each in (exploration_n_steps, mode_n_steps))
         windows = self._windows(rows, exploration_n_steps, mode_n_steps)
-        notes = self.notes.take(windows)
+        notes = self.read_notes(windows)
         goals_are_told: Any = self.goals_are_told
         relabelling = None
         if self.hindsight is not None and self.has_hindsight and n_groups > 1:

@@ -1,6 +1,6 @@
 """Replay buffer whose transitions lie in rows, wherever there is room: how they are written and read."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -45,6 +45,8 @@ class RowReplayBuffer(ReplayBuffer):
     dones: np.ndarray
     timeouts: np.ndarray
     next_row: np.ndarray
+    #: Value of each note that is the same at all steps of the buffer's algorithm: it is not stored
+    constant_notes: ClassVar[dict[str, Any]] = {}
     #: For the exploration bonus, which writes them: places that an episode saw first, number of the known route that it had
     #: come along by then, and whether its visits count
     first_visits: np.ndarray
@@ -124,16 +126,34 @@ class RowReplayBuffer(ReplayBuffer):
         """What is read at the row of a step."""
         return {**self._observation_fields("observations"), "actions": ((self.action_dim,), np.float32)}
 
-    def _note_fields(self) -> Fields:
-        """What is read at all rows of a window."""
+    def note_fields(self) -> Fields:
+        """
+        :return: What is read at all rows of a window, also what ``constant_notes`` says
+        """
         own: Fields = {"rewards": ((), np.float32), "next_row": ((), np.int32), "dones": ((), bool), "timeouts": ((), bool)}
         return {**own, "followed": ((), np.int32), "first_visits": ((), bool), "counted": ((), bool)}
 
     def part_fields(self) -> tuple[Fields, Fields, Fields]:
         """
-        :return: Fields of the three parts of a row: step, next observation, notes
+        :return: Fields of the three parts of a row that are stored: step, next observation, notes
         """
-        return self._step_fields(), self._observation_fields("next_observations"), self._note_fields()
+        notes = {name: each for name, each in self.note_fields().items() if name not in self.constant_notes}
+        return self._step_fields(), self._observation_fields("next_observations"), notes
+
+    def read_notes(self, rows: np.ndarray) -> Any:
+        """
+        :param rows: Any shape
+        :return: Their notes by name, each of the same shape: copies, but for ``constant_notes``
+        """
+        records = self.notes.take(rows)
+        if not self.constant_notes:
+            return records
+        return {name: records[name] for name in self.notes.fields} | self._constant_notes(rows.shape)
+
+    def _constant_notes(self, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+        """Of each one value that is read as an array of a shape; writing raises ValueError."""
+        fields = self.note_fields()
+        return {name: np.broadcast_to(fields[name][1](value), shape) for name, value in self.constant_notes.items()}
 
     def allocate(self) -> None:
         """
@@ -161,8 +181,10 @@ class RowReplayBuffer(ReplayBuffer):
         self.observations = self._as_observation(self.steps, "observations")
         self.next_observations = self._as_observation(self.nexts, "next_observations")
         self.actions = self.steps["actions"]
-        for name in self._note_fields():
+        for name in self.notes.fields:
             setattr(self, name, self.notes[name])
+        for name, constant in self._constant_notes((self.buffer_size,)).items():
+            setattr(self, name, constant)
 
     def _as_observation(self, fields: Any, name: str) -> Any:
         """One array or tensor, or a dict of them."""

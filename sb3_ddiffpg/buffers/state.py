@@ -215,10 +215,10 @@ def fields_of_0_1(buffer: Any) -> tuple[Fields, ...]:
     :param buffer: A ``ModeReplayBuffer``
     :return: What the parts of its rows held in version 0.1: names of then, and target actions of each algorithm
     """
-    steps, nexts, notes = buffer.part_fields()
+    steps, nexts, _ = buffer.part_fields()
     own = {name: each for name, each in steps.items() if name not in buffer.target_action_fields}
     targets = dict.fromkeys(("target_actions", "exploratory_target_actions"), steps["actions"])
-    return {**own, **targets}, nexts, {_NOTES_OF_0_1.get(name, name): each for name, each in notes.items()}
+    return {**own, **targets}, nexts, {_NOTES_OF_0_1.get(name, name): each for name, each in buffer.note_fields().items()}
 
 
 def _converted(raw: np.ndarray, old: np.dtype, new: np.dtype) -> np.ndarray:

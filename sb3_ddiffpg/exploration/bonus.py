@@ -33,8 +33,9 @@ _SAMPLE = 20_000
 
 
 class Notes(Protocol):
-    """What the bonus notes of each stored step, by row: arrays of a replay buffer."""
+    """What the bonus notes of each stored step, by row: arrays of a replay buffer. Without modes there are no known routes."""
 
+    has_modes: bool
     first_visits: np.ndarray
     followed: np.ndarray
     counted: np.ndarray
@@ -108,8 +109,9 @@ class ExplorationBonus:
         rows, positions = record.rows, record.positions
         if self.routes.routes and record.scale is not None:  # else nothing can be compared yet
             self.routes.observe(positions / record.scale)
-        followed = notes.followed[rows] = self.routes.followed.copy()
-        counts = notes.counted[rows] = followed == NO_ROUTE
+        counts = self.routes.followed == NO_ROUTE
+        if notes.has_modes:
+            notes.followed[rows], notes.counted[rows] = self.routes.followed, counts
         known = self.grid.edges is not None  # else all is told again when they are, see ``review``
         notes.first_visits[rows] = self.episode_cells.observe(record, self.grid) if self.settings.episodic and known else True
         if counts.any() and (known or not isinstance(self.novelty_model, CellTable)):

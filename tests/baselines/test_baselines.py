@@ -5,6 +5,7 @@ import re
 from collections import defaultdict
 from copy import deepcopy
 from functools import partial
+from typing import ClassVar
 from unittest.mock import patch
 
 import gymnasium as gym
@@ -27,6 +28,7 @@ from sb3_ddiffpg.baselines import BASELINES, DIPO, RPG, SACC51, TD3C51, Consiste
 from sb3_ddiffpg.baselines.baseline import FifoReplayBuffer
 from sb3_ddiffpg.baselines.consistency_ac import SIGMA_MAX, SIGMA_MIN, karras_sigmas
 from sb3_ddiffpg.baselines.dipo import TargetActionReplayBuffer
+from sb3_ddiffpg.buffers.assigned_buffer import AssignedReplayBuffer
 from sb3_ddiffpg.evaluation.evaluate import evaluate_modes
 from sb3_ddiffpg.networks.diffusion import variance_preserving_betas
 
@@ -186,6 +188,13 @@ def test_target_actions_are_stored_for_those_who_improve_them(kind, fields, tmp_
     # Four bytes a number: the observation's 3 and the action's 2, and 2 for each target action; 3 of the next observation
     assert buffer.steps.bytes.shape == (50, 4 * (3 + 2 + 2 * len(fields))) and buffer.nexts.bytes.shape == (50, 4 * 3)
     assert tuple(buffer.steps.fields) == ("observations", "actions", *fields)
+    # Reward and next row have four bytes, and one each whether it is done, by a time limit, a first visit, a goal. With modes
+    # also the route that it came along, how new that is, whether its visit counts, whether it is off its mode's route or an
+    # off-mode success: 2 times 4 bytes and 3, each kept at a multiple of its size
+    has_modes = kind is ModeReplayBuffer
+    assert buffer.notes.bytes.shape == (50, 28 if has_modes else 12)
+    # Where each row stands among all rows, and among its mode's
+    assert buffer.storage_bytes == 50 * (4 * (8 + 2 * len(fields)) + (28 + 8 if has_modes else 12 + 4))
     for name in ("target_actions", "exploratory_target_actions"):
         assert hasattr(buffer, name) == (name in fields)
     batch = buffer.sample_modes(8, 0.9, 1, 1)
@@ -199,6 +208,27 @@ def test_target_actions_are_stored_for_those_who_improve_them(kind, fields, tmp_
     again = load_from_pkl(tmp_path / "buffer.pkl")
     assert type(again) is kind and tuple(again.steps.fields) == ("observations", "actions", *fields)
     np.testing.assert_array_equal(again.steps.bytes[: buffer.pos], buffer.steps.bytes[: buffer.pos])
+
+
+def test_what_without_modes_is_always_the_same_is_not_stored(algorithm):
+    """Learning from it is the same, number for number, as from a buffer that stores all of it."""
+
+    class Stores(small(algorithm).replay_buffer_class):
+        constant_notes: ClassVar[dict] = {}
+        has_modes = True
+        hindsight = None
+
+        def claim(self, env):
+            super(AssignedReplayBuffer, self).claim(env)
+
+    frugal, lavish = (small(algorithm, replay_buffer_class=kind, seed=3).learn(120) for kind in (None, Stores))
+    assert lavish.replay_buffer.notes.bytes.shape[1] == frugal.replay_buffer.notes.bytes.shape[1] + 16
+    for mine, other in zip(frugal.policy.parameters(), lavish.policy.parameters(), strict=True):
+        assert th.equal(mine, other)
+    for name, value in frugal.replay_buffer.constant_notes.items():
+        assert (getattr(lavish.replay_buffer, name)[lavish.replay_buffer.stored_rows.rows[:20]] == value).all()
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(frugal.replay_buffer, name)[:] = value
 
 
 def test_which_baseline_stores_target_actions(algorithm):

@@ -36,7 +36,10 @@ class Alone:
             grid=CellGrid(1, 1.0),
         )
         self.notes = SimpleNamespace(
-            first_visits=np.zeros(100, dtype=bool), followed=np.full(100, -7, np.int32), counted=np.zeros(100, dtype=bool)
+            has_modes=True,
+            first_visits=np.zeros(100, dtype=bool),
+            followed=np.full(100, -7, np.int32),
+            counted=np.zeros(100, dtype=bool),
         )
         self.n_rows, self.began = 0, [False] * n_envs
 
