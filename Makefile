@@ -4,16 +4,17 @@ PYTHON := $(shell python3.11 -c "print('python3.11')" 2>/dev/null || echo python
 BIN := .venv/bin
 DEPENDENCIES := setup.cfg pyproject.toml constraints.txt
 
-.PHONY: demo test docs fast slow gpu fuzz oldest soak lint type format bench clean
+.PHONY: demo test docs fast slow gpu fuzz oldest soak lint type format bench release-check clean
 
 demo: .venv/.installed
 	$(BIN)/python examples/demo.py
 
 test: lint type fast
 
-# a warning or a dead link is an error
-docs: .venv-docs/.installed
-	.venv-docs/bin/sphinx-build --quiet --fresh-env --fail-on-warning --keep-going -c docs -d build/doctrees . build/docs
+# a warning, a dead link or a cell that fails is an error. TUTORIALS=off runs no cell: the site then needs no torch
+TUTORIALS ?= cache
+docs: .venv-docs/.installed $(if $(filter off,$(TUTORIALS)),,.venv-docs/.kernel)
+	OMP_NUM_THREADS=1 .venv-docs/bin/sphinx-build -D nb_execution_mode=$(TUTORIALS) --quiet --fresh-env --fail-on-warning --keep-going -c docs -d build/doctrees . build/docs
 
 # one torch thread per worker: the workers already fill the cores
 fast: .venv/.installed-dev
@@ -58,6 +59,10 @@ format: .venv/.installed-dev
 bench: .venv/.installed-dev
 	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
 
+# what the release workflow does: wheel and sdist in dist/, checked, and the quickstart where nothing else is installed
+release-check:
+	.ci/release-check $(PYTHON)
+
 clean:
 	rm -rf .venv .venv-docs .venv-oldest build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
 
@@ -73,6 +78,11 @@ clean:
 .venv-docs/.installed: $(DEPENDENCIES)
 	$(PYTHON) -m venv --clear .venv-docs
 	.venv-docs/bin/pip install --quiet -c constraints.txt $$(sed -n '/^docs =/,/^[a-z]/s/^    \([a-z]\)/\1/p' setup.cfg)
+	touch $@
+
+# the pages' notebooks are run by the Python that has the package
+.venv-docs/.kernel: .venv-docs/.installed .venv/.installed-dev
+	JUPYTER_PATH=$(CURDIR)/.venv-docs/share/jupyter $(BIN)/python -m ipykernel install --prefix .venv-docs --name python3 > /dev/null
 	touch $@
 
 .venv:

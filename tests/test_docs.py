@@ -121,6 +121,24 @@ def test_every_page_is_in_the_navigation():
     assert not (missing := found - named), missing
 
 
+NOTEBOOK = """---
+jupytext:
+  text_representation:
+    extension: .md
+    format_name: myst
+kernelspec:
+  display_name: Python 3
+  name: python3
+---
+"""
+
+
+def test_tutorials_open_as_notebooks():
+    """The site's build runs them; without all of these lines Jupyter would see a single cell of text."""
+    pages = [page for page in (ROOT / "docs" / "tutorials").glob("*.md") if page.name != "index.md"]
+    assert len(pages) == 5 and all(page.read_text().startswith(NOTEBOOK) for page in pages)
+
+
 def quickstart() -> str:
     (code,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "quickstart.md").read_text(), re.MULTILINE | re.DOTALL)
     return code

@@ -185,6 +185,8 @@ def test_extras_are_enough(extras, modules):
 def test_one_version(config):
     version = config["metadata"]["version"]
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version
+    assert f"version = {{{version}}}" in (ROOT / "docs" / "citing.md").read_text()
+    assert f'__version__ = "{version}"' in (ROOT / "sb3_ddiffpg" / "__init__.py").read_text()
     assert re.search(rf"^## \[{re.escape(version)}\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
 
 
