@@ -44,7 +44,7 @@ NAME = "sb3_ddiffpg"
 #: The packages from the lowest up: each imports only those before it
 ORDER = (
     *("utils", "serialization", "clustering", "networks", "buffers", "exploration", "modes", "envs", "saving", "common"),
-    *("evaluation", "visualization", "callbacks", "ddiffpg", "check", "baselines", "zoo", "experiments"),
+    *("evaluation", "planning", "visualization", "callbacks", "ddiffpg", "check", "baselines", "zoo", "experiments"),
 )
 #: What ``__init__.py`` and the modules beside it count as
 TOP = "(top)"

@@ -44,7 +44,7 @@ class Browser:
         _wait(lambda: told.is_file() and "\n" in told.read_text(), "Chromium did not start")
         port, path = told.read_text().split("\n")[:2]
         self._open = ExitStack()
-        self._socket = self._open.enter_context(connect(f"ws://127.0.0.1:{port}{path}", max_size=None))
+        self._socket = self._open.enter_context(connect(f"ws://127.0.0.1:{port}{path}", max_size=None, ping_interval=None))
         self._numbers, self._session = itertools.count(1), None
         #: What the page has written to the console as an error, and exceptions
         self.errors: list[str] = []

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 from math import isfinite
 from typing import Any
 
-from sb3_ddiffpg.utils.settings import SHARE, Accepted, Settings, at_least, is_integer, is_number, setting
+from sb3_ddiffpg.utils.settings import FLAG, SHARE, Accepted, Settings, at_least, is_integer, is_number, setting
 
 _FACTOR = Accepted("lie in [0, 10]", lambda value: is_number(value) and 0 <= value <= 10)
 
@@ -49,6 +49,7 @@ class WorldChange(Settings):
     :param gravity: factor on gravity
     :param n_blocked: number of a maze's passages that are walled, drawn for each episode. It takes the place of the maze's own
         ``n_blocked``, and one goal that can be reached is enough
+    :param ends_at_goal: whether a maze's episode ends at a goal; else it goes on, and the goal pays at each step there
     :param joint_range: share that is left of the range of an arm's joints, around the angles at which episodes begin, 0 for a
         joint that is stuck: one number for all, or shares by joint
     :param obstacle: box beside an arm: x, y and z of its centre, and its three edges, in metres
@@ -61,6 +62,7 @@ class WorldChange(Settings):
     friction: float = setting(1.0, _FACTOR)
     gravity: float = setting(1.0, _FACTOR)
     n_blocked: int | None = setting(None, at_least(0).or_none())
+    ends_at_goal: bool = setting(True, FLAG)
     joint_range: float | Mapping[int, float] = setting(1.0, _SHARES)
     obstacle: tuple[float, ...] | None = setting(None, _OBSTACLE.or_none())
     closed: tuple[str, ...] = setting((), _NAMES)

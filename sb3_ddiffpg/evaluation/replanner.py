@@ -19,6 +19,24 @@ def _as_stored(observation: Any, space: spaces.Space) -> Any:
     return maybe_transpose(np.asarray(observation), space) if is_image_space(space) else observation
 
 
+def as_batch(space: spaces.Space, observation: Any) -> tuple[Any, bool]:
+    """
+    :param space: Of the model
+    :param observation: One observation or a batch of N
+    :return: The batch, images with their channels as the model has them, and whether one was given
+    """
+    if isinstance(observation, dict):
+        parts: Any = space
+        observation = {key: _as_stored(value, parts[key]) for key, value in observation.items()}
+    else:
+        observation = _as_stored(observation, space)
+    if is_vectorized_observation(observation, space):
+        return observation, False
+    if isinstance(observation, dict):
+        return {key: np.asarray(value)[None] for key, value in observation.items()}, True
+    return np.asarray(observation)[None], True
+
+
 class Replanner:
     """
     Acts by one mode, and by the next one when the agent has not moved for some steps. What has failed in an episode is tried
@@ -105,7 +123,7 @@ class Replanner:
         """
         if [mode.number for mode in self.model.modes] != self._numbers:
             raise RuntimeError("The model's modes are others since this Replanner was made: make another")
-        batch, is_single = self._as_batch(observation)
+        batch, is_single = as_batch(self.model.observation_space, observation)
         positions = self._positions(batch)
         n = len(positions)
         if state is None:
@@ -141,18 +159,6 @@ class Replanner:
             batch, state=state[4:] or None, episode_start=begins, deterministic=deterministic, mode=modes
         )
         return actions[0] if is_single else actions, (rank, anchor, still, failed, *(followed or ()))
-
-    def _as_batch(self, observation: Any) -> tuple[Any, bool]:
-        space = self.model.observation_space
-        if isinstance(observation, dict):
-            observation = {key: _as_stored(value, space[key]) for key, value in observation.items()}
-        else:
-            observation = _as_stored(observation, space)
-        if is_vectorized_observation(observation, space):
-            return observation, False
-        if isinstance(observation, dict):
-            return {key: np.asarray(value)[None] for key, value in observation.items()}, True
-        return np.asarray(observation)[None], True
 
     def _fresh(self, n: int, positions: np.ndarray) -> tuple[np.ndarray, ...]:
         still = np.zeros(n, dtype=np.int64)

@@ -57,7 +57,7 @@ class AntSimulation(MazeSimulation):
     half_size = 0.9
     action_dim = 8
     body = "an ant"
-    changeable = ("motor_strength", "friction", "gravity", "n_blocked")
+    changeable = ("motor_strength", "friction", "gravity", "n_blocked", "ends_at_goal")
 
     def __init__(
         self,

@@ -100,7 +100,7 @@ class MazeEnv(gym.Env[npt.NDArray[Any], npt.NDArray[Any]]):
         info: dict[str, Any] = {"is_success": goal_id >= 0, "goal_id": None, "mode": None}
         if goal_id >= 0:
             info.update(goal_id=goal_id, mode=self.simulation.label(0, goal_id))
-        terminated = goal_id >= 0 or bool(self.simulation.lost()[0])
+        terminated = (goal_id >= 0 and self.simulation.changes.ends_at_goal) or bool(self.simulation.lost()[0])
         return self.simulation.observations()[0], float(self.simulation.rewards[goal_id]), terminated, False, info
 
     def state_dict(self) -> dict[str, Any]:
@@ -205,24 +205,22 @@ class MazeVecEnv(VecEnv):
         """
         goal_ids = self.simulation.move(self._actions)
         self._steps += 1
-        terminated = (goal_ids >= 0) | self.simulation.lost()
+        terminated = ((goal_ids >= 0) & self.simulation.changes.ends_at_goal) | self.simulation.lost()
         dones = terminated | (self._steps >= self.max_episode_steps)
         observations = self.simulation.observations()
         ongoing = {"is_success": False, "goal_id": None, "mode": None, "TimeLimit.truncated": False}
         infos: list[dict[str, Any]] = [ongoing.copy() for _ in range(self.num_envs)]
+        for i in np.flatnonzero(goal_ids >= 0).tolist():
+            goal_id = int(goal_ids[i])
+            infos[i].update(is_success=True, goal_id=goal_id, mode=self.simulation.label(i, goal_id))
         done = np.flatnonzero(dones).tolist()
         if done:
             for i in done:
-                self._close_episode(i, int(goal_ids[i]), infos[i])
                 infos[i]["TimeLimit.truncated"] = not terminated[i]
                 infos[i]["terminal_observation"] = observations[i].copy()
             self._begin(done, [{}] * len(done))
             observations = self.simulation.observations()
         return observations, self.simulation.rewards[goal_ids].astype(np.float32), dones, infos
-
-    def _close_episode(self, i: int, goal_id: int, info: dict[str, Any]) -> None:
-        if goal_id >= 0:
-            info.update(is_success=True, goal_id=goal_id, mode=self.simulation.label(i, goal_id))
 
     def state_dict(self) -> dict[str, Any]:
         """

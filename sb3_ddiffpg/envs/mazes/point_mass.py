@@ -46,7 +46,7 @@ class PointSimulation(MazeSimulation):
     half_size = HALF_SIZE
     action_dim = 2
     body = "a point mass"
-    changeable = ("motor_strength", "friction", "n_blocked")
+    changeable = ("motor_strength", "friction", "n_blocked", "ends_at_goal")
 
     def __init__(
         self,

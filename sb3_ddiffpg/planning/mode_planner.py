@@ -1,0 +1,340 @@
+"""Going to a goal, or anywhere else, over places that are known, and another way where one is blocked."""
+
+import copy
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import msgspec
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_ddiffpg.evaluation.environments import evaluation_environments
+from sb3_ddiffpg.evaluation.replanner import as_batch
+from sb3_ddiffpg.planning.place_graph import PlaceGraph, Plan
+from sb3_ddiffpg.planning.practice import Wanderer
+from sb3_ddiffpg.planning.travels import (
+    Senses,
+    Travel,
+    newest,
+    recorded_travels,
+    stored_travels,
+    travels_of_state,
+    travels_state,
+)
+from sb3_ddiffpg.planning.waypoint_policy import WaypointPolicy
+from sb3_ddiffpg.serialization.safetensors_tree import check_array, convert, read, write
+
+#: Gradient steps of the waypoint policy, each time that it learns
+N_UPDATES = 2000
+#: A way is blocked if nothing was gained in so many times the steps that it takes to cross a place
+PATIENCE = 3.0
+#: A waypoint is so far ahead, at most, in places
+LOOK_AHEAD = 2.0
+#: Half of what is held to be blocked, in places; each further failure at the same place makes it so many times as wide
+BLOCKED, WIDER = 2.0, 1.5
+#: A place is visited within this distance of it, in places
+ARRIVED = 0.5
+#: Deviation of the noise on actions, unless they are deterministic: what stands still is shaken loose
+NOISE = 0.1
+# Places ahead that may become the waypoint
+_MOST_AHEAD = 5
+_KIND = "planner"
+
+
+class _State(msgspec.Struct, forbid_unknown_fields=True):
+    scale: np.ndarray
+    crossing: float
+    graph: Any
+    policy: Any
+    travels: Any
+
+
+@dataclass(frozen=True)
+class _Trip:
+    """
+    Where one environment is on its way. ``stage`` targets are visited; ``best`` are the fewest steps that were left so far,
+    and for ``still`` steps there were not fewer. ``failed_at`` is where a way was blocked the last time, ``width`` how wide.
+    """
+
+    plan: Plan
+    stage: int = 0
+    penalty: np.ndarray | None = None
+    best: float = np.inf
+    still: int = 0
+    failed_at: np.ndarray | None = None
+    width: float = BLOCKED
+
+
+class ModePlanner:
+    """
+    Acts like a model: follows the shortest known way to a goal, and where it is blocked another one, back if need be. It is
+    used in ``evaluate_policy`` and ``run_episodes``, with any number of environments.
+
+    It knows places, the ways between them, and by a ``WaypointPolicy`` how to go them: from the episodes in the model's replay
+    buffer, if it has one, and from those of ``practise``. It finds a way blocked as ``Replanner`` does, by not getting on; but
+    it need not have a mode for every way around.
+
+    :param model: A DDiffPG whose mode features say where the agent is
+    :param normalizer: Statistics by which observations are normalised; those of the model's environment when None
+    :raises ValueError: If the model observes images, has no mode features or lacks its normaliser
+    """
+
+    travels: list[Travel]
+    scale: np.ndarray
+    graph: PlaceGraph
+    policy: WaypointPolicy
+    #: Steps that it takes to cross a place
+    crossing: float
+
+    def __init__(self, model: Any, normalizer: VecNormalize | None = None) -> None:
+        if not hasattr(model, "resolved_features"):
+            raise ValueError(
+                f"model: a {type(model).__name__} given; accepted is a DDiffPG, whose mode features say where it is"
+            )
+        self.normalizer = model.get_vec_normalize_env() if normalizer is None else normalizer
+        if self.normalizer is None and model.is_normalized:
+            raise ValueError(
+                "normalizer: None given, but the model was trained on normalised observations and has no environment"
+            )
+        self.model = model
+        self.success_key, self.resolved_features = model.success_key, model.resolved_features
+        self.senses = Senses(model.observation_space, self.resolved_features)
+        #: Places to visit, in this order, in units of the mode features; None: any goal
+        self.targets: np.ndarray | None = None
+        buffer = getattr(model, "replay_buffer", None)
+        self.travels = stored_travels(buffer, self.senses) if buffer is not None and buffer.size() else []
+        if self.travels:
+            self._learn()
+
+    # ------------------------------------------------------------------ learning
+
+    def practise(self, env: gym.Env | VecEnv | str, n_episodes: int = 50) -> float:
+        """
+        Learn from further episodes: without any knowledge those of the model, then always such that go from place to place.
+
+        :param env: Environments as the model was trained in, or the id of one
+        :param n_episodes: Number of episodes of each kind
+        :return: Squared error of the waypoint policy's actions
+        """
+        if not isinstance(env, VecEnv):
+            with evaluation_environments(self.model, env, n_episodes) as made:
+                return self.practise(made, n_episodes)
+        if not self.travels:
+            self._record(self.model, env, n_episodes)
+            self._learn()
+        self._record(Wanderer(self), env, n_episodes)
+        return self._learn()
+
+    def _record(self, agent: Any, env: VecEnv, n_episodes: int) -> None:
+        self.travels += recorded_travels(agent, self.model, self.senses, self.original, env, n_episodes)
+        self.travels = newest(self.travels)
+
+    def _learn(self) -> float:
+        places = np.concatenate([each.places for each in self.travels])
+        deviations = places.std(axis=0).astype(np.float64)
+        # Positions have one unit. What was found in an observation has one for each component
+        standardize = getattr(getattr(self.model, "replay_buffer", None), "standardize", False)
+        self.scale = (
+            np.where(deviations > 0, deviations, 1.0) if standardize else np.full(len(deviations), deviations.max() or 1.0)
+        )
+        self.graph = PlaceGraph.of(self.travels, self.scale)
+        paths = [each.places / self.scale for each in self.travels if each.success or not len(self.graph.goals)]
+        steps = np.concatenate([np.linalg.norm(np.diff(path, axis=0), axis=1) for path in paths])
+        self.crossing = float(self.graph.spacing / max(steps.mean(), 1e-9))
+        if not hasattr(self, "policy"):
+            horizon = max(round(LOOK_AHEAD * self.crossing), 1)
+            self.policy = WaypointPolicy(self.senses.n_inputs, self.senses.features.dim, self._action_dim, horizon)
+        error = self.policy.fit(self.travels, self.scale, N_UPDATES)
+        self._plan_first()
+        return error
+
+    @property
+    def _action_dim(self) -> int:
+        return int(np.prod(self.model.action_space.shape))
+
+    # ------------------------------------------------------------------ where to
+
+    def go_to(self, *places: Sequence[float]) -> "ModePlanner":
+        """
+        Make an agent that visits places, one after the other in each episode, and stays at the last one.
+
+        :param places: At least one, in units of the mode features, shape [dim] each
+        :return: The agent, which knows what this planner knows
+        :raises ValueError: If a place is none, or far from all that is known
+        """
+        self._check_ready()
+        dim = self.senses.features.dim
+        if not places or any(np.shape(each) != (dim,) or not np.isfinite(each).all() for each in places):
+            raise ValueError(f"places: {places} given; accepted is at least one of {dim} finite numbers each")
+        agent = copy.copy(self)
+        agent.targets = np.array(places, dtype=np.float64)
+        positions = agent.targets / self.scale
+        far = np.linalg.norm(positions - self.graph.positions[self.graph.nearest(positions)], axis=1) > 2 * self.graph.spacing
+        if far.any():
+            raise ValueError(f"places: nobody has been near {agent.targets[far].tolist()}")
+        agent._plan_first()
+        return agent
+
+    def _goal_places(self, stage: int) -> np.ndarray:
+        if self.targets is None:
+            return np.unique(self.graph.goal_places)
+        return self.graph.nearest(self.targets[stage : stage + 1] / self.scale)
+
+    def _plan_first(self) -> None:
+        self._first = self.graph.plan(self._goal_places(0))
+        finite = self._first.left[np.isfinite(self._first.left)]
+        #: Longer than any way around
+        self._detour = float(finite.max()) if len(finite) else 0.0
+
+    def _check_ready(self) -> None:
+        if not self.travels:
+            raise RuntimeError("The model has no replay buffer to learn places from: call practise(env) first")
+
+    # ------------------------------------------------------------------ acting
+
+    def original(self, observation: Any) -> Any:
+        """
+        :param observation: As the model sees it
+        :return: As the environment made it
+        """
+        return observation if self.normalizer is None else self.normalizer.unnormalize_obs(observation)
+
+    def act(self, original: Any, directions: np.ndarray, noise: np.ndarray | float) -> np.ndarray:
+        """
+        :param original: Batch of N observations, not normalised
+        :param directions: Where to go from there, shape [N, dim]
+        :param noise: Deviation of the noise on each environment's actions, shape [N]
+        :return: Actions in [-1, 1], shape [N, action_dim]
+        """
+        actions = self.policy(self.senses.inputs(original), directions)
+        drawn = np.reshape(noise, (-1, 1)) * np.random.standard_normal(actions.shape)
+        return np.clip(actions + drawn, -1.0, 1.0).astype(np.float32)
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[Any, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[Any, ...]]:
+        """
+        :param observation: One observation or a batch of N
+        :param state: What the previous call returned: where each environment is on its way
+        :param episode_start: Which environments begin an episode
+        :param deterministic: Whether actions have no noise
+        :return: The actions and the state for the next call
+        :raises RuntimeError: If it knows no places yet, or no goal
+        :raises ValueError: If the state is of another number of environments
+        """
+        self._check_ready()
+        if self.targets is None and not len(self.graph.goals):
+            raise RuntimeError("No episode that is known has reached a goal: go_to(place) goes elsewhere")
+        batch, is_single = as_batch(self.model.observation_space, observation)
+        original = self.original(batch)
+        positions = self.senses.places(original) / self.scale
+        n = len(positions)
+        if state is not None and len(state) != n:
+            raise ValueError(f"state: of {len(state)} environment(s) given for {n} observation(s)")
+        begins = np.zeros(n, dtype=bool) if episode_start is None else np.asarray(episode_start, dtype=bool).reshape(n)
+        trips = [_Trip(self._first) if state is None or begins[i] else state[i] for i in range(n)]
+        waypoints = np.empty_like(positions)
+        for i, place in enumerate(self.graph.nearest(positions).tolist()):
+            trips[i], waypoints[i] = self._next(trips[i], positions[i], place)
+        actions = self.act(original, waypoints - positions, 0.0 if deterministic else NOISE)
+        actions = self.model.policy.unscale_action(actions)
+        return actions[0] if is_single else actions, tuple(trips)
+
+    def _next(self, trip: _Trip, position: np.ndarray, place: int) -> tuple[_Trip, np.ndarray]:
+        """One more step of a trip, and where it goes from here."""
+        graph = self.graph
+        if self.targets is not None and trip.stage + 1 < len(self.targets):
+            away = np.linalg.norm(self.targets[trip.stage] / self.scale - position)
+            if away < ARRIVED * graph.spacing:
+                trip = _Trip(graph.plan(self._goal_places(trip.stage + 1), trip.penalty), trip.stage + 1, trip.penalty)
+        left = trip.plan.left[place] + np.linalg.norm(graph.positions[place] - position) / graph.spacing * self.crossing
+        if left < trip.best - 0.5 * self.crossing:
+            trip = replace(trip, best=left, still=0)
+        else:
+            trip = replace(trip, still=trip.still + 1)
+        if trip.still > PATIENCE * self.crossing:
+            trip = self._blocked(trip, position, place)
+        return trip, self._waypoint(trip, position, place)
+
+    def _waypoint(self, trip: _Trip, position: np.ndarray, place: int) -> np.ndarray:
+        """The farthest of the next places to which one can go straight, at the end the target itself."""
+        graph = self.graph
+        ahead = trip.plan.ahead(place, _MOST_AHEAD)
+        points = graph.positions[ahead]
+        if trip.plan.after[ahead[-1]] < 0:
+            points = np.concatenate((points, self._target(trip.stage, points[-1])[None]))
+        points = points[1:] if len(points) > 1 else points
+        near = np.linalg.norm(points - position, axis=1) <= LOOK_AHEAD * graph.spacing
+        straight = np.flatnonzero(near & graph.sees(position, points))
+        return points[straight[-1]] if len(straight) else points[0]
+
+    def _target(self, stage: int, position: np.ndarray) -> np.ndarray:
+        """Where a trip ends that has come to the place of its target: there, or amid the ends of those that reached a goal."""
+        if self.targets is not None:
+            return self.targets[stage] / self.scale
+        close = np.linalg.norm(self.graph.goals - position, axis=1) < 1.5 * self.graph.spacing
+        return self.graph.goals[close].mean(axis=0) if close.any() else position
+
+    def _blocked(self, trip: _Trip, position: np.ndarray, place: int) -> _Trip:
+        """Go around what lies ahead. At the same place again it was wider than thought."""
+        graph = self.graph
+        ahead = trip.plan.ahead(place, 3)
+        into = graph.positions[ahead[-1]] - position
+        into /= max(np.linalg.norm(into), 1e-9)
+        again = trip.failed_at is not None and np.linalg.norm(trip.failed_at - position) < 2 * graph.spacing
+        width = WIDER * trip.width if again else BLOCKED
+        found = graph.around(position + width * graph.spacing * into, width * graph.spacing)
+        found = found[np.linalg.norm(graph.positions[found] - position, axis=1) > graph.spacing]
+        penalty = np.zeros(len(graph)) if trip.penalty is None else trip.penalty.copy()
+        penalty[found] += self._detour  # not for ever: where all is blocked, the least is tried again
+        return _Trip(graph.plan(self._goal_places(trip.stage), penalty), trip.stage, penalty, failed_at=position, width=width)
+
+    # ------------------------------------------------------------------ saving
+
+    def save(self, path: str | os.PathLike) -> None:
+        """
+        Write what it knows, without the model, into a file.
+
+        :param path: Of the file, a safetensors file without code
+        :raises OSError: If it cannot be written; what was there before still is
+        """
+        self._check_ready()
+        parts = {"graph": self.graph.state_dict(), "policy": self.policy.state_dict(), "travels": travels_state(self.travels)}
+        write(Path(path), _KIND, {"scale": self.scale, "crossing": self.crossing, **parts})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike, model: Any, normalizer: VecNormalize | None = None) -> "ModePlanner":
+        """
+        :param path: Of a file that ``save`` wrote
+        :param model: The model of which it was
+        :param normalizer: See ``ModePlanner``
+        :return: A planner that knows what that one knew
+        :raises ValueError: If the file is damaged, or of a model with other spaces
+        """
+        state = convert(read(Path(path), _KIND), _State, "planner")
+        planner = cls.__new__(cls)
+        buffered = model.replay_buffer
+        try:
+            model.replay_buffer = None  # what it holds is not to be learned anew
+            planner.__init__(model, normalizer)  # type: ignore[misc]
+        finally:
+            model.replay_buffer = buffered
+        dim = planner.senses.features.dim
+        planner.scale = check_array(state.scale, np.float64, [dim], "planner.scale")
+        if not (np.isfinite(planner.scale).all() and (planner.scale > 0).all() and 0 < state.crossing < np.inf):
+            raise ValueError("planner: accepted are a positive scale and crossing")
+        planner.crossing = state.crossing
+        planner.travels = travels_of_state(state.travels, planner.senses.n_inputs, dim, planner._action_dim)
+        planner.graph = PlaceGraph.from_state(state.graph, dim)
+        planner.policy = WaypointPolicy(planner.senses.n_inputs, dim, planner._action_dim, horizon=1)
+        planner.policy.load_state_dict(state.policy)
+        planner._plan_first()
+        return planner
