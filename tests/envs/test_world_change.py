@@ -43,6 +43,34 @@ def test_no_change_changes_nothing(env_id):
         np.testing.assert_array_equal(trajectory(gym.make(env_id, changes=changes)), expected)
 
 
+# ---------------------------------------------------------------------- a goal that does not end an episode
+
+
+def test_an_episode_may_go_on_after_a_goal():
+    """A single environment and many: at each step in the goal there is its reward and its label, and the time limit ends it."""
+    maze, kwargs = ["#####", "#rg.#", "#####"], {"start_noise": 0.0, "changes": {"ends_at_goal": False}}
+    one = gym.wrappers.TimeLimit(PointMazeEnv(maze, **kwargs), 30)
+    many = PointMazeVecEnv(2, maze_map=maze, max_episode_steps=30, **kwargs)
+    ended = PointMazeEnv(maze, start_noise=0.0)
+    position, inside = one.reset()[0][:1], []
+    many.reset()
+    ended.reset()
+    for step in range(30):
+        observation, reward, terminated, truncated, info = one.step(np.array([1.0, 0.0]))
+        _, rewards, dones, infos = many.step(np.tile([1.0, 0.0], (2, 1)))
+        position = observation[0]
+        at_goal = abs(position - one.unwrapped.maze.goals[0][0]) <= 1.0
+        inside.append(at_goal)
+        assert reward == rewards[0] == rewards[1] == float(at_goal) and info["is_success"] == infos[0]["is_success"] == at_goal
+        assert info["mode"] == infos[1]["mode"] and (info["mode"] is not None) == at_goal
+        assert not terminated and truncated == (step == 29) and dones.tolist() == [step == 29] * 2
+        if at_goal and sum(inside) == 1:
+            assert ended.step(np.array([1.0, 0.0]))[2]  # where it usually ends
+        elif not sum(inside):
+            assert not ended.step(np.array([1.0, 0.0]))[2]
+    assert 0 < sum(inside) < 30 and not inside[-1]  # through it, to the wall beyond
+
+
 # ---------------------------------------------------------------------- the ant
 
 
@@ -257,7 +285,7 @@ def test_changes_come_from_files(load):
         ({"motor_strength": {-1: 0.5}}, "changes.motor_strength must be a share"),
         ({"motor_strength": {8: 0.5}}, r"changes.motor_strength: \[8\] given; accepted are the numbers 0 to 7"),
         ({"n_blocked": 1.5}, "changes.n_blocked must be an integer of at least 0, or be None, got 1.5"),
-        ({"joint_range": 0.5}, r"changes.joint_range: 0.5 given, but an ant in a maze has none; accepted are \['friction'"),
+        ({"joint_range": 0.5}, r"changes.joint_range: 0.5 given, but an ant in a maze has none; accepted are \['ends_at_goal', 'friction'"),
         ({"obstacle": (0, 0, 0, 1, 1, 0)}, "changes.obstacle must be x, y and z of a box's centre"),
         ({"closed": "left"}, "changes.closed must be a list of names, got 'left'"),
         (0.5, "changes must be WorldChange or a dict of some of them, got 0.5"),
