@@ -1,7 +1,6 @@
 """What evaluation during training shows of the modes."""
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from sb3_ddiffpg.evaluation.evaluate import evaluate_modes
 from sb3_ddiffpg.evaluation.results import ModeEvaluation
 from sb3_ddiffpg.evaluation.rollout import knows_success
 from sb3_ddiffpg.serialization.safetensors_tree import convert
-from sb3_ddiffpg.utils.disk import missed_if_full
+from sb3_ddiffpg.utils.disk import missed_if_full, written_whole
 from sb3_ddiffpg.utils.rng import preserved_rng
 from sb3_ddiffpg.utils.vec_envs import labels_routes
 
@@ -167,9 +166,8 @@ class EvaluateModesCallback(_PeriodicCallback):
         # Of equals the later one has seen more
         reached = score(found)
         if self.best_model_path is not None and reached >= self._best:
-            unfinished = self.best_model_path.with_name(f".{self.best_model_path.stem}.zip")
-            self.model.save(unfinished)
-            os.replace(unfinished, self.best_model_path)  # whole, or the one before
+            with written_whole(self.best_model_path) as unfinished:
+                self.model.save(unfinished)
             self._best, self.best_step = reached, self.num_timesteps
             normalizer = self.model.get_vec_normalize_env()
             if normalizer is not None:

@@ -1,13 +1,14 @@
 """What ``ddiffpg watch`` shows of a run in progress."""
 
-import os
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_ddiffpg.utils.disk import written_whole
 from sb3_ddiffpg.utils.vec_envs import env_attribute
 from sb3_ddiffpg.visualization.sketch import LIVE_FILE, sketch
 
@@ -45,13 +46,8 @@ class LiveCallback(BaseCallback):
 
     def write(self) -> None:
         """Write the file now; nothing is raised if it cannot be."""
-        path = self.folder / LIVE_FILE
-        unfinished = path.with_suffix(f".{os.getpid()}.tmp")
         env: Any = self.training_env
         spec = env_attribute(env, "spec")
-        try:
-            found = sketch(self.model, "" if spec is None else spec.id, env_attribute(env, "maze"))
+        found = sketch(self.model, "" if spec is None else spec.id, env_attribute(env, "maze"))
+        with suppress(OSError), written_whole(self.folder / LIVE_FILE) as unfinished:  # not worth the run
             unfinished.write_bytes(msgspec.json.encode(found))
-            os.replace(unfinished, path)
-        except OSError:  # not worth the run
-            unfinished.unlink(missing_ok=True)

@@ -20,6 +20,7 @@ from torch import nn
 
 from sb3_ddiffpg.ddiffpg.policies import DETERMINISTIC_SAMPLES, DiffusionPolicy
 from sb3_ddiffpg.networks.critics import ALL_GROUPS
+from sb3_ddiffpg.utils.disk import written_whole
 from sb3_ddiffpg.utils.rng import preserved_rng
 
 #: Of an output that onnxruntime gives beside that of torch, actions in [-1, 1]
@@ -182,14 +183,9 @@ def export_onnx(model: Any, path: str | os.PathLike, mode: int | None = None) ->
         content = _exported(with_exact_activations(graph), inputs)
         for key, value in _metadata(model, mode).items():
             content.model.metadata_props[key] = value
-        path = Path(path)
-        unfinished = path.with_name(f"{path.name}.{os.getpid()}.unfinished")
-        try:
+        with written_whole(Path(path)) as unfinished:
             content.save(unfinished, external_data=False)
             _compare(graph, inputs, unfinished)
-            os.replace(unfinished, path)
-        finally:
-            unfinished.unlink(missing_ok=True)
 
 
 def _example(graph: PolicyGraph) -> dict[str, th.Tensor]:

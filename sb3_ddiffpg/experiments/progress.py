@@ -1,11 +1,13 @@
 """How far a training is, in a small file that others read while it runs."""
 
-import os
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
 from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_ddiffpg.utils.disk import written_whole
 
 _SECONDS_BETWEEN = 1.0
 
@@ -29,13 +31,9 @@ def write_progress(folder: Path, progress: Progress) -> None:
     :param folder: Of the training
     :param progress: How far it is
     """
-    path = folder / "progress.json"
-    unfinished = path.with_suffix(".tmp")
-    try:
+    # A full disk must not end a training for the sake of a progress bar
+    with suppress(OSError), written_whole(folder / "progress.json") as unfinished:
         unfinished.write_bytes(msgspec.json.encode(progress))
-        os.replace(unfinished, path)
-    except OSError:  # a full disk must not end a training for the sake of a progress bar
-        unfinished.unlink(missing_ok=True)
 
 
 def read_progress(folder: Path) -> Progress | None:

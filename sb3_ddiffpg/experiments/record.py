@@ -1,6 +1,5 @@
 """``config.yml`` in a training's folder: what was asked for, how to do it again, where it ran and what it took."""
 
-import os
 import shlex
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -12,6 +11,7 @@ import yaml
 
 from sb3_ddiffpg.experiments.machine import git_commit, machine
 from sb3_ddiffpg.experiments.trial import Trial
+from sb3_ddiffpg.utils.disk import written_whole
 from sb3_ddiffpg.utils.versions import versions
 
 _FILE = "config.yml"
@@ -144,6 +144,5 @@ def write_record(record: dict[str, Any], folder: Path) -> None:
     :param record: Of a training
     :param folder: Where it goes
     """
-    unfinished = folder / "logs" / _FILE
-    unfinished.write_text(yaml.safe_dump(record, sort_keys=False))
-    os.replace(unfinished, folder / _FILE)
+    with written_whole(folder / _FILE) as unfinished:
+        unfinished.write_text(yaml.safe_dump(record, sort_keys=False))

@@ -4,7 +4,6 @@ One training that leaves all that is needed to judge it and to do it again, in o
 """
 
 import argparse
-import os
 import shutil
 import signal
 import sys
@@ -42,6 +41,7 @@ from sb3_ddiffpg.experiments.record import (
 from sb3_ddiffpg.experiments.trial import Tests, Trial, hyperparameters
 from sb3_ddiffpg.saving.algorithm import SavableAlgorithm
 from sb3_ddiffpg.saving.checkpoint import checkpoint_files
+from sb3_ddiffpg.utils.disk import written_whole
 from sb3_ddiffpg.zoo import ALGO, ALGOS, ModeExperimentManager
 
 N_CHECKPOINTS = 30
@@ -168,9 +168,8 @@ class _Training:
 
     def _keep_final(self, model: Any) -> None:
         """In place of the one that did best in a test."""
-        unfinished = self.logs / "model.zip"
-        shutil.copy(self.logs / "final_model.zip", unfinished)
-        os.replace(unfinished, self.folder / "model.zip")
+        with written_whole(self.folder / "model.zip") as unfinished:
+            shutil.copy(self.logs / "final_model.zip", unfinished)
         if (normalizer := model.get_vec_normalize_env()) is not None:
             normalizer.save(str(self.folder / "vecnormalize.pkl"))
 
@@ -191,9 +190,8 @@ class _Training:
             tested, found = self._tested(path, test_env, seed)
             found.save(self.folder / ("evaluation.json" if name == "best" else "logs/evaluation_final.json"))
             if name == "best" and isinstance(tested, ActorCriticAlgorithm):
-                smaller = self.logs / "model_to_act.zip"
-                tested.save(smaller, to_train=False)
-                os.replace(smaller, path)  # there is no other copy
+                with written_whole(path) as smaller:  # there is no other copy
+                    tested.save(smaller, to_train=False)
             print(f"\n{name} model\n{found}")
         for env_id in self.trial.tests.also:
             found = self._evaluate_elsewhere(tested, env_id, seed, env_kwargs)

@@ -1,9 +1,11 @@
-"""What a run writes beside its checkpoints, and goes on without: where the disk is full, a warning says so."""
+"""Files that are whole or not there, and such as a run goes on without: where the disk is full, a warning says so."""
 
 import errno
+import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TypeVar
 
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
@@ -25,6 +27,23 @@ def missed_if_full(what: str) -> Iterator[None]:
         if error.errno not in _FULL:
             raise
         warnings.warn(f"{what} cannot be written: {error}. Training goes on without")
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """
+    Let a file be written so that at any moment the one before or the whole new one is there.
+
+    :param path: Of the file
+    :return: Where to write it, beside its place and with its suffix. An error leaves nothing there
+    """
+    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.unfinished{path.suffix}")
+    try:
+        yield unfinished
+        os.replace(unfinished, path)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise
 
 
 class SparedResultsWriter:

@@ -47,7 +47,7 @@ def test_no_change_changes_nothing(env_id):
 
 
 def test_an_episode_may_go_on_after_a_goal():
-    """A single environment and many: at each step in the goal there is its reward and its label, and the time limit ends it."""
+    """A single environment and many: at each step in the goal there is its reward and its label. The time limit ends it."""
     maze, kwargs = ["#####", "#rg.#", "#####"], {"start_noise": 0.0, "changes": {"ends_at_goal": False}}
     one = gym.wrappers.TimeLimit(PointMazeEnv(maze, **kwargs), 30)
     many = PointMazeVecEnv(2, maze_map=maze, max_episode_steps=30, **kwargs)
@@ -285,7 +285,10 @@ def test_changes_come_from_files(load):
         ({"motor_strength": {-1: 0.5}}, "changes.motor_strength must be a share"),
         ({"motor_strength": {8: 0.5}}, r"changes.motor_strength: \[8\] given; accepted are the numbers 0 to 7"),
         ({"n_blocked": 1.5}, "changes.n_blocked must be an integer of at least 0, or be None, got 1.5"),
-        ({"joint_range": 0.5}, r"changes.joint_range: 0.5 given, but an ant in a maze has none; accepted are \['ends_at_goal', 'friction'"),
+        (
+            {"joint_range": 0.5},
+            r"changes.joint_range: 0.5 given, but an ant in a maze has none; accepted are \['ends_at_goal', 'friction'",
+        ),
         ({"obstacle": (0, 0, 0, 1, 1, 0)}, "changes.obstacle must be x, y and z of a box's centre"),
         ({"closed": "left"}, "changes.closed must be a list of names, got 'left'"),
         (0.5, "changes must be WorldChange or a dict of some of them, got 0.5"),
