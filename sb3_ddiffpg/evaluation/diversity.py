@@ -1,5 +1,6 @@
 """Measures of diversity under the names of those who made them, from counts of episodes by route."""
 
+from collections import Counter
 from collections.abc import Sequence
 from math import comb, log
 
@@ -60,11 +61,37 @@ def few_shot_robustness(counts: Sequence[int], n_goals: int, n_episodes: int, n_
     """
     n_trials = min(n_trials, n_episodes)
     # ways[r, t]: choices of t episodes that reach r different goals
-    ways = np.zeros((len(counts) + 1, n_trials + 1))
+    # Whole numbers, which may be larger than floats can be
+    ways = np.zeros((len(counts) + 1, n_trials + 1), dtype=object)
     ways[0] = [comb(n_episodes - sum(counts), t) for t in range(n_trials + 1)]
     for count in counts:
-        own = [0.0] + [float(comb(count, t)) for t in range(1, n_trials + 1)]
+        own = np.array([0] + [comb(count, t) for t in range(1, n_trials + 1)], dtype=object)
         more = np.stack([np.convolve(before, own)[: n_trials + 1] for before in ways[:-1]])
         ways[1:] += more
-    share = ways[:, n_trials] / comb(n_episodes, n_trials)
-    return float(sum(p * success_after_removal(n_goals, r, n_removed) for r, p in enumerate(share) if p))
+    shares = [int(each) / comb(n_episodes, n_trials) for each in ways[:, n_trials]]
+    return sum(share * success_after_removal(n_goals, r, n_removed) for r, share in enumerate(shares) if share)
+
+
+def qd_archive(
+    solutions: Sequence[Sequence[tuple[str | None, float]]], cells: Sequence[str], corrected: bool = True
+) -> dict[str, float]:
+    """
+    Keep the best solution of each cell, as quality-diversity libraries (pyribs, QDax) do. Evaluated once, a lucky solution
+    stays in a cell where it seldom comes; corrected for that, it is where it comes most often, with its median objective.
+
+    :param solutions: Evaluations of each solution: the cell in which it came to lie, None for none, and its objective
+    :param cells: Names of the cells that there are
+    :param corrected: Whether all evaluations of a solution count, or only the first
+    :return: Objective of the best solution in each cell that is filled
+    """
+    archive: dict[str, float] = {}
+    for evaluations in solutions:
+        counted = list(evaluations) if corrected else list(evaluations[:1])
+        if not counted:
+            continue
+        # Of several that are as frequent the one that came first
+        cell = Counter(cell for cell, _ in counted).most_common(1)[0][0]
+        objective = float(np.median([objective for _, objective in counted]))
+        if cell in cells:
+            archive[str(cell)] = max(objective, archive.get(str(cell), -np.inf))
+    return archive

@@ -173,6 +173,32 @@ class ModeEvaluation:
         n_episodes = self.uncommanded.n_episodes
         return diversity.few_shot_robustness(self._listed_counts(), len(self.listed), n_episodes, n_removed, n_trials)
 
+    def qd_archive(self, corrected: bool = True) -> dict[str, float]:
+        """
+        Take the listed routes as the cells of a quality-diversity archive (pyribs, QDax), commanded modes as its solutions,
+        and returns as their objective.
+
+        :param corrected: Whether a mode is where most of its episodes are, with their median return, or where the first one is
+        :return: Return of the best mode in each route that has one
+        :raises ValueError: If the episodes are not there, as in an evaluation from a file
+        """
+        runs = [self.episodes.get(str(each.mode)) for each in self.commanded]
+        if any(run is None for run in runs):
+            raise ValueError("The evaluation holds no single episodes: it is from a file. Evaluate the model again")
+        solutions = [[(each.label if each.success else None, each.episode_return) for each in run or ()] for run in runs]
+        return diversity.qd_archive(solutions, self.listed, corrected)
+
+    def qd_score(self, offset: float = 0.0, corrected: bool = True) -> float:
+        """
+        Add up the returns of the best modes by listed route: the QD-score.
+
+        :param offset: What is added to each return, so that none is negative
+        :param corrected: See ``qd_archive``
+        :return: The sum over the routes that have a mode
+        :raises ValueError: See ``qd_archive``
+        """
+        return sum(each + offset for each in self.qd_archive(corrected).values())
+
     @property
     def commandable(self) -> list[str]:
         """Routes that some command takes in at least 95 % of its episodes."""

@@ -13,9 +13,11 @@ from sb3_ddiffpg.evaluation.diversity import (
     behavior_entropy,
     few_shot_robustness,
     multi_goal_score,
+    qd_archive,
     success_after_removal,
 )
 from sb3_ddiffpg.evaluation.results import CommandResult, ModeEvaluation
+from sb3_ddiffpg.evaluation.rollout import EpisodeResult
 
 
 def evaluation(labels, n_episodes, listed):
@@ -86,3 +88,40 @@ def test_without_listed_routes():
     assert all(map(math.isnan, (found.behavior_entropy, found.reachable_modes, found.multi_goal_score)))
     assert math.isnan(found.few_shot_robustness(1))
     assert found.to_dict()["summary"]["multi_goal_score"] is None
+
+
+def test_robustness_of_many_trials():
+    """Numbers of choices beyond what a float holds: 600 trials of 2000 episodes that reach all goals leave one of two."""
+    assert few_shot_robustness([1000, 500], 2, 2000, 1, n_trials=600) == pytest.approx(1.0)
+    assert few_shot_robustness([1500, 0], 2, 2000, 1, n_trials=600) == pytest.approx(0.5)
+
+
+ARCHIVE = [
+    [("up", 3.0), ("down", 1.0), ("down", 2.0), (None, 0.0)],  # was lucky once
+    [("up", 1.0), ("up", 1.5), ("up", 5.0)],
+    [("up", 2.0), ("up", 1.0)],
+    [(None, 0.0), ("left", 9.0), ("left", 9.0)],
+    [("elsewhere", 7.0)],
+    [],
+]
+
+
+@pytest.mark.parametrize(("corrected", "expected"), [(False, {"up": 3.0}), (True, {"down": 1.5, "up": 1.5, "left": 9.0})])
+def test_archive_by_hand(corrected, expected):
+    assert qd_archive(ARCHIVE, ["up", "down", "left", "right"], corrected) == expected
+
+
+def test_score_of_an_evaluation_by_hand():
+    """Failures lie in no cell, whatever the environment calls their route."""
+
+    def runs(*labels):
+        return [EpisodeResult(label != "lost", 5, value, label, np.zeros((6, 2))) for label, value in labels]
+
+    episodes = {"a": runs(("up", 1.0), ("up", 3.0), ("lost", 0.0)), "b": runs(("lost", 0.0), ("lost", -2.0), ("down", 1.0))}
+    commanded = tuple(CommandResult(name, 3, 2, 5.0, 1.0, {}) for name in episodes)
+    uncommanded = CommandResult(None, 1, 0, 5.0, 0.0, {})
+    found = ModeEvaluation("Maze-v0", "environment", ("up", "down", "lost"), 0.0, uncommanded, commanded, (), True, episodes)
+    assert found.qd_archive() == {"up": 1.0} and found.qd_score(offset=0.5) == 1.5
+    assert found.qd_archive(corrected=False) == {"up": 1.0} and found.qd_score(corrected=False) == 1.0
+    with pytest.raises(ValueError, match="from a file"):
+        ModeEvaluation.from_dict(found.to_dict()).qd_score()
