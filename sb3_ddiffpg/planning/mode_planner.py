@@ -48,6 +48,7 @@ _KIND = "planner"
 class _State(msgspec.Struct, forbid_unknown_fields=True):
     scale: np.ndarray
     crossing: float
+    modes_lead: bool
     graph: Any
     policy: Any
     travels: Any
@@ -58,6 +59,7 @@ class _Trip:
     """
     Where one environment is on its way. ``stage`` targets are visited; ``best`` are the fewest steps that were left so far,
     and for ``still`` steps there were not fewer. ``failed_at`` is where a way was blocked the last time, ``width`` how wide.
+    While a ``mode`` drives, ``anchor`` is where it was last seen to move, and ``heading`` from where.
     """
 
     plan: Plan
@@ -67,6 +69,9 @@ class _Trip:
     still: int = 0
     failed_at: np.ndarray | None = None
     width: float = BLOCKED
+    mode: int | None = None
+    anchor: np.ndarray | None = None
+    heading: np.ndarray | None = None
 
 
 class ModePlanner:
@@ -76,7 +81,8 @@ class ModePlanner:
 
     It knows places, the ways between them, and by a ``WaypointPolicy`` how to go them: from the episodes in the model's replay
     buffer, if it has one, and from those of ``practise``. It finds a way blocked as ``Replanner`` does, by not getting on; but
-    it need not have a mode for every way around.
+    it need not have a mode for every way around. Where practice has shown that the model arrives more often than it does, an
+    episode begins with the mode that the critics value most, and it takes over when that does not get on.
 
     :param model: A DDiffPG whose mode features say where the agent is
     :param normalizer: Statistics by which observations are normalised; those of the model's environment when None
@@ -105,6 +111,8 @@ class ModePlanner:
         self.senses = Senses(model.observation_space, self.resolved_features)
         #: Places to visit, in this order, in units of the mode features; None: any goal
         self.targets: np.ndarray | None = None
+        #: Whether an episode to a goal begins with a mode
+        self.modes_lead = False
         buffer = getattr(model, "replay_buffer", None)
         self.travels = stored_travels(buffer, self.senses) if buffer is not None and buffer.size() else []
         if self.travels:
@@ -114,7 +122,8 @@ class ModePlanner:
 
     def practise(self, env: gym.Env | VecEnv | str, n_episodes: int = 50) -> float:
         """
-        Learn from further episodes: without any knowledge those of the model, then always such that go from place to place.
+        Learn from further episodes: of the model, such that go from place to place, and of the planner itself, once it knows
+        a goal. Modes lead from then on if the model has reached its goals more often than the planner.
 
         :param env: Environments as the model was trained in, or the id of one
         :param n_episodes: Number of episodes of each kind
@@ -123,15 +132,26 @@ class ModePlanner:
         if not isinstance(env, VecEnv):
             with evaluation_environments(self.model, env, n_episodes) as made:
                 return self.practise(made, n_episodes)
-        if not self.travels:
-            self._record(self.model, env, n_episodes)
+        begins = not self.travels
+        model_success = self._record(self.model, env, n_episodes)
+        if begins:
             self._learn()
         self._record(Wanderer(self), env, n_episodes)
-        return self._learn()
+        error = self._learn()
+        if self._knows_goal:
+            self.modes_lead = False
+            self.modes_lead = model_success > self._record(self, env, n_episodes)
+        return error
 
-    def _record(self, agent: Any, env: VecEnv, n_episodes: int) -> None:
-        self.travels += recorded_travels(agent, self.model, self.senses, self.original, env, n_episodes)
-        self.travels = newest(self.travels)
+    def _record(self, agent: Any, env: VecEnv, n_episodes: int) -> float:
+        """Run episodes of an agent and remember them; the share that reached a goal."""
+        recorded = recorded_travels(agent, self.model, self.senses, self.original, env, n_episodes)
+        self.travels = newest([*self.travels, *recorded])
+        return float(np.mean([each.success for each in recorded]))
+
+    @property
+    def _knows_goal(self) -> bool:
+        return len(self.graph.goals) > 0
 
     def _learn(self) -> float:
         places = np.concatenate([each.places for each in self.travels])
@@ -231,7 +251,7 @@ class ModePlanner:
         :raises ValueError: If the state is of another number of environments
         """
         self._check_ready()
-        if self.targets is None and not len(self.graph.goals):
+        if self.targets is None and not self._knows_goal:
             raise RuntimeError("No episode that is known has reached a goal: go_to(place) goes elsewhere")
         batch, is_single = as_batch(self.model.observation_space, observation)
         original = self.original(batch)
@@ -240,13 +260,35 @@ class ModePlanner:
         if state is not None and len(state) != n:
             raise ValueError(f"state: of {len(state)} environment(s) given for {n} observation(s)")
         begins = np.zeros(n, dtype=bool) if episode_start is None else np.asarray(episode_start, dtype=bool).reshape(n)
+        begins |= state is None
         trips = [_Trip(self._first) if state is None or begins[i] else state[i] for i in range(n)]
+        if self.modes_lead and self.targets is None and begins.any():
+            best = self.model.mode_values(batch).argmax(axis=1).tolist()
+            trips = [replace(each, mode=best[i]) if begins[i] else each for i, each in enumerate(trips)]
         waypoints = np.empty_like(positions)
         for i, place in enumerate(self.graph.nearest(positions).tolist()):
-            trips[i], waypoints[i] = self._next(trips[i], positions[i], place)
+            trips[i] = trip = self._led(trips[i], positions[i])
+            if trip.mode is None:
+                trips[i], waypoints[i] = self._next(trip, positions[i], place)
+            else:
+                waypoints[i] = positions[i]
         actions = self.act(original, waypoints - positions, 0.0 if deterministic else NOISE)
         actions = self.model.policy.unscale_action(actions)
+        led = np.array([trip.mode is not None for trip in trips])
+        if led.any():
+            modes = np.array([trip.mode or 0 for trip in trips])
+            actions[led] = self.model.predict(batch, episode_start=begins, deterministic=deterministic, mode=modes)[0][led]
         return actions[0] if is_single else actions, tuple(trips)
+
+    def _led(self, trip: _Trip, position: np.ndarray) -> _Trip:
+        """One more step of a trip that a mode drives, if one does, until it does not get on."""
+        if trip.mode is None:
+            return trip
+        if trip.anchor is None or np.linalg.norm(position - trip.anchor) > 0.5 * self.graph.spacing:
+            return replace(trip, anchor=position, heading=trip.anchor, still=0)
+        if trip.still <= PATIENCE * self.crossing:
+            return replace(trip, still=trip.still + 1)
+        return self._blocked(trip, position, position - (position if trip.heading is None else trip.heading))
 
     def _next(self, trip: _Trip, position: np.ndarray, place: int) -> tuple[_Trip, np.ndarray]:
         """One more step of a trip, and where it goes from here."""
@@ -261,7 +303,7 @@ class ModePlanner:
         else:
             trip = replace(trip, still=trip.still + 1)
         if trip.still > PATIENCE * self.crossing:
-            trip = self._blocked(trip, position, place)
+            trip = self._blocked(trip, position, graph.positions[trip.plan.ahead(place, 3)[-1]] - position)
         return trip, self._waypoint(trip, position, place)
 
     def _waypoint(self, trip: _Trip, position: np.ndarray, place: int) -> np.ndarray:
@@ -283,12 +325,10 @@ class ModePlanner:
         close = np.linalg.norm(self.graph.goals - position, axis=1) < 1.5 * self.graph.spacing
         return self.graph.goals[close].mean(axis=0) if close.any() else position
 
-    def _blocked(self, trip: _Trip, position: np.ndarray, place: int) -> _Trip:
-        """Go around what lies ahead. At the same place again it was wider than thought."""
+    def _blocked(self, trip: _Trip, position: np.ndarray, into: np.ndarray) -> _Trip:
+        """Go around what lies in this direction. At the same place again it was wider than thought."""
         graph = self.graph
-        ahead = trip.plan.ahead(place, 3)
-        into = graph.positions[ahead[-1]] - position
-        into /= max(np.linalg.norm(into), 1e-9)
+        into = into / max(np.linalg.norm(into), 1e-9)
         again = trip.failed_at is not None and np.linalg.norm(trip.failed_at - position) < 2 * graph.spacing
         width = WIDER * trip.width if again else BLOCKED
         found = graph.around(position + width * graph.spacing * into, width * graph.spacing)
@@ -308,7 +348,7 @@ class ModePlanner:
         """
         self._check_ready()
         parts = {"graph": self.graph.state_dict(), "policy": self.policy.state_dict(), "travels": travels_state(self.travels)}
-        write(Path(path), _KIND, {"scale": self.scale, "crossing": self.crossing, **parts})
+        write(Path(path), _KIND, {"scale": self.scale, "crossing": self.crossing, "modes_lead": self.modes_lead, **parts})
 
     @classmethod
     def load(cls, path: str | os.PathLike, model: Any, normalizer: VecNormalize | None = None) -> "ModePlanner":
@@ -331,7 +371,7 @@ class ModePlanner:
         planner.scale = check_array(state.scale, np.float64, [dim], "planner.scale")
         if not (np.isfinite(planner.scale).all() and (planner.scale > 0).all() and 0 < state.crossing < np.inf):
             raise ValueError("planner: accepted are a positive scale and crossing")
-        planner.crossing = state.crossing
+        planner.crossing, planner.modes_lead = state.crossing, state.modes_lead and len(getattr(model, "modes", ())) > 0
         planner.travels = travels_of_state(state.travels, planner.senses.n_inputs, dim, planner._action_dim)
         planner.graph = PlaceGraph.from_state(state.graph, dim)
         planner.policy = WaypointPolicy(planner.senses.n_inputs, dim, planner._action_dim, horizon=1)

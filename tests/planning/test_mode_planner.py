@@ -198,7 +198,7 @@ def test_saves_and_loads(planner, tmp_path):
     obs = np.random.default_rng(0).uniform(0, 10, (20, 3)).astype(np.float32)
     np.testing.assert_array_equal(planner.predict(obs, deterministic=True)[0], again.predict(obs, deterministic=True)[0])
     again.practise(DummyVecEnv([TwoGaps]), 1)
-    assert len(again.travels) == len(planner.travels) + 1
+    assert len(again.travels) == len(planner.travels) + 3  # of the model, from place to place, and of the planner
     whole = (tmp_path / "planner").read_bytes()
     (tmp_path / "damaged").write_bytes(whole[:-8] + bytes(8))
     with pytest.raises(ValueError, match="damaged"):
@@ -259,3 +259,53 @@ def test_is_pickled_with_its_state(planner):
     first, _ = planner.predict(obs, state, deterministic=True)
     second, _ = planner.predict(obs, again, deterministic=True)
     np.testing.assert_array_equal(first, second)
+
+
+class Leads:
+    """The model of a planner, whose only mode goes straight on; what it asks of the model otherwise, the model says."""
+
+    def __init__(self, model):
+        self.model, self.asked = model, []
+
+    def __getattr__(self, name):
+        return getattr(self.model, name)
+
+    def mode_values(self, observations):
+        return np.tile([0.0, 1.0], (len(observations), 1))
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False, mode=None):
+        self.asked.append(np.array(mode))
+        return np.tile([0.4, 0.0], (len(observation), 1)).astype(np.float32), None
+
+
+def test_a_mode_leads_until_it_does_not_get_on(planner):
+    """Straight on is the wall between the gaps: there the planner takes over, and goes round."""
+    agent = copy.copy(planner)
+    agent.model, agent.modes_lead = Leads(planner.model), True
+    np.random.seed(0)
+    (episode,) = run_episodes(agent, DummyVecEnv([TwoGaps]), 1)
+    assert episode.success
+    assert all(mode.tolist() == [1] for mode in agent.model.asked)  # the one of more value
+    led = len(agent.model.asked)
+    at_the_wall = int(np.argmax(episode.path[:, 0] > 4.5))
+    assert at_the_wall < led < episode.length
+    np.testing.assert_allclose(episode.path[: at_the_wall + 1, 1], START[1])
+    assert planner.go_to(GOAL).modes_lead is False
+
+
+@pytest.mark.parametrize(("of_model", "leads"), [(0.0, False), (1.0, False), (2.0, True)])
+def test_modes_lead_where_they_arrive_more_often(planner, of_model, leads, monkeypatch):
+    """The planner arrives always, so that only a model that were better than that would lead."""
+    agent = copy.copy(planner)
+    agent.policy = copy.deepcopy(planner.policy)
+    record = ModePlanner._record
+    shares = iter([of_model, None, None])
+
+    def told(self, *args):
+        found = record(self, *args)
+        return found if (share := next(shares)) is None else share
+
+    monkeypatch.setattr(ModePlanner, "_record", told)
+    np.random.seed(0)
+    agent.practise(DummyVecEnv([TwoGaps]), 2)
+    assert agent.modes_lead is leads
