@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_ddiffpg.evaluation.environments import evaluation_environments
 from sb3_ddiffpg.evaluation.replanner import as_batch
-from sb3_ddiffpg.planning.place_graph import PlaceGraph, Plan
+from sb3_ddiffpg.planning.place_graph import RESOLUTION, PlaceGraph, Plan
 from sb3_ddiffpg.planning.practice import Wanderer
 from sb3_ddiffpg.planning.travels import (
     Senses,
@@ -330,7 +330,7 @@ class ModePlanner:
         graph = self.graph
         into = into / max(np.linalg.norm(into), 1e-9)
         again = trip.failed_at is not None and np.linalg.norm(trip.failed_at - position) < 2 * graph.spacing
-        width = WIDER * trip.width if again else BLOCKED
+        width = min(WIDER * trip.width, RESOLUTION) if again else BLOCKED  # no more than all
         found = graph.around(position + width * graph.spacing * into, width * graph.spacing)
         found = found[np.linalg.norm(graph.positions[found] - position, axis=1) > graph.spacing]
         penalty = np.zeros(len(graph)) if trip.penalty is None else trip.penalty.copy()

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ddiffpg.evaluation import run_episodes
 from sb3_ddiffpg.planning import ModePlanner, mode_planner
+from sb3_ddiffpg.planning.place_graph import RESOLUTION
 from sb3_ddiffpg.planning.travels import MOST_STEPS, Senses, Travel, newest
 
 START, GOAL = np.array([1.0, 5.0]), np.array([9.0, 5.0])
@@ -115,6 +116,13 @@ def test_where_all_is_closed_it_goes_on_trying(planner):
         assert not each.success and each.length == 250
         touched = each.path[each.path[:, 0] > 4.3, 1]
         assert touched.min() < 4 and touched.max() > 6  # at both
+
+
+def test_what_never_moves_is_not_blocked_beyond_all_bounds(planner):
+    obs, state = np.array([[*START, 0.5]], dtype=np.float32), None
+    for _ in range(400):
+        _, state = planner.predict(obs, state)
+    assert 10 < state[0].width <= RESOLUTION and np.isfinite(state[0].penalty).all()
 
 
 def test_visits_places_one_after_the_other(planner):
