@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from scipy.stats import binomtest
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_ddiffpg.evaluation.environments import evaluation_environments
 from sb3_ddiffpg.evaluation.rollout import run_episodes
@@ -64,17 +64,31 @@ def adapt(model: Any, env: gym.Env | VecEnv | str, n_trials: int = 20) -> Adapta
         with evaluation_environments(model, env, 1) as made:
             return adapt(model, made, n_trials)
     names = [mode.name for mode in model.modes]
-    values = model.mode_values(env.reset()).mean(axis=0)
+    values = model.mode_values(_first_observations(env)).mean(axis=0)
     spread = np.ptp(values)
     prior = (values - values.min()) / spread if spread > 0 else np.full(len(names), 0.5)
+    told = False
     wins, losses = np.zeros(len(names), dtype=int), np.zeros(len(names), dtype=int)
     while (done := int(wins.sum() + losses.sum())) < n_trials:
         tried = int(np.random.beta(1 + prior + wins, 2 - prior + losses).argmax())
         for episode in run_episodes(model, env, min(env.num_envs, n_trials - done), mode=names[tried]):
-            if episode.success is None:
-                raise ValueError("env: it does not say what a success is, see success_key")
-            wins[tried] += episode.success
+            told |= episode.success is not None
+            wins[tried] += bool(episode.success)  # some speak only of successes
             losses[tried] += not episode.success
+    if not told:
+        raise ValueError("env: it does not say what a success is, see success_key")
     best = int(((1 + prior + wins) / (3 + wins + losses)).argmax())
     trials = dict(zip(names, (wins + losses).tolist(), strict=True))
     return Adaptation(names[best], trials, dict(zip(names, wins.tolist(), strict=True)))
+
+
+def _first_observations(env: VecEnv) -> Any:
+    """Of new episodes, of which the statistics of a normaliser do not hear."""
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is None:
+        return env.reset()
+    was_training, normalizer.training = normalizer.training, False
+    try:
+        return env.reset()
+    finally:
+        normalizer.training = was_training

@@ -10,8 +10,9 @@ from typing import Any
 import gymnasium as gym
 import msgspec
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
+from sb3_ddiffpg.buffers.features import same_selection
 from sb3_ddiffpg.evaluation.environments import evaluation_environments
 from sb3_ddiffpg.evaluation.replanner import as_batch
 from sb3_ddiffpg.planning.place_graph import RESOLUTION, PlaceGraph, Plan
@@ -49,6 +50,7 @@ class _State(msgspec.Struct, forbid_unknown_fields=True):
     scale: np.ndarray
     crossing: float
     modes_lead: bool
+    features: list[int] | str | None
     graph: Any
     policy: Any
     travels: Any
@@ -81,12 +83,14 @@ class ModePlanner:
 
     It knows places, the ways between them, and by a ``WaypointPolicy`` how to go them: from the episodes in the model's replay
     buffer, if it has one, and from those of ``practise``. It finds a way blocked as ``Replanner`` does, by not getting on; but
-    it need not have a mode for every way around. Where practice has shown that the model arrives more often than it does, an
-    episode begins with the mode that the critics value most, and it takes over when that does not get on.
+    it need not have a mode for every way around. Where practice has shown that more goals are reached so, an episode begins
+    with the mode that the critics value most, and the planner takes over when that does not get on.
+
+    A goal is any that an episode has reached; what an observation says of a desired one is not heeded, see ``go_to``.
 
     :param model: A DDiffPG whose mode features say where the agent is
     :param normalizer: Statistics by which observations are normalised; those of the model's environment when None
-    :raises ValueError: If the model observes images, has no mode features or lacks its normaliser
+    :raises ValueError: If the model is none with mode features, observes images or lacks its normaliser
     """
 
     travels: list[Travel]
@@ -122,30 +126,42 @@ class ModePlanner:
 
     def practise(self, env: gym.Env | VecEnv | str, n_episodes: int = 50) -> float:
         """
-        Learn from further episodes: of the model, such that go from place to place, and of the planner itself, once it knows
-        a goal. Modes lead from then on if the model has reached its goals more often than the planner.
+        Learn from further episodes: those of the model if nothing is known yet, such that go from place to place, and once a
+        goal is known those of the planner, led by modes and by itself. Modes lead from then on if that reached more goals.
 
         :param env: Environments as the model was trained in, or the id of one
         :param n_episodes: Number of episodes of each kind
         :return: Squared error of the waypoint policy's actions
         """
         if not isinstance(env, VecEnv):
-            with evaluation_environments(self.model, env, n_episodes) as made:
+            with evaluation_environments(self.model, env, max(n_episodes, 1)) as made:
                 return self.practise(made, n_episodes)
-        begins = not self.travels
-        model_success = self._record(self.model, env, n_episodes)
-        if begins:
+        self._check_practice(env, n_episodes)
+        if not self.travels:
+            self._record(self.model, env, n_episodes)
             self._learn()
         self._record(Wanderer(self), env, n_episodes)
         error = self._learn()
-        if self._knows_goal:
-            self.modes_lead = False
-            self.modes_lead = model_success > self._record(self, env, n_episodes)
+        if self.targets is None and self._knows_goal and len(getattr(self.model, "modes", ())):
+            success = {}
+            for self.modes_lead in (True, False):
+                success[self.modes_lead] = self._record(self, env, n_episodes)
+            self.modes_lead = success[True] > success[False]
         return error
+
+    def _check_practice(self, env: VecEnv, n_episodes: int) -> None:
+        if isinstance(n_episodes, bool) or not isinstance(n_episodes, (int, np.integer)) or n_episodes < 1:
+            raise ValueError(f"n_episodes: {n_episodes!r} given; accepted are whole numbers from 1 up")
+        if not same_selection(self.model.resolved_features, self.resolved_features):
+            raise RuntimeError("The model's mode features are others since this planner was made: make another")
+        if (self.normalizer is None) != (unwrap_vec_normalize(env) is None):
+            raise ValueError("env: it must be normalised if the model was trained on normalised observations, and only then")
 
     def _record(self, agent: Any, env: VecEnv, n_episodes: int) -> float:
         """Run episodes of an agent and remember them; the share that reached a goal."""
         recorded = recorded_travels(agent, self.model, self.senses, self.original, env, n_episodes)
+        if not all(np.isfinite(part).all() for each in recorded for part in (each.inputs, each.places, each.actions)):
+            raise ValueError("env: it gave observations that are not finite; nothing is learned from these episodes")
         self.travels = newest([*self.travels, *recorded])
         return float(np.mean([each.success for each in recorded]))
 
@@ -191,6 +207,7 @@ class ModePlanner:
         if not places or any(np.shape(each) != (dim,) or not np.isfinite(each).all() for each in places):
             raise ValueError(f"places: {places} given; accepted is at least one of {dim} finite numbers each")
         agent = copy.copy(self)
+        agent.policy = copy.deepcopy(self.policy)  # which further practice changes
         agent.targets = np.array(places, dtype=np.float64)
         positions = agent.targets / self.scale
         far = np.linalg.norm(positions - self.graph.positions[self.graph.nearest(positions)], axis=1) > 2 * self.graph.spacing
@@ -259,9 +276,10 @@ class ModePlanner:
         n = len(positions)
         if state is not None and len(state) != n:
             raise ValueError(f"state: of {len(state)} environment(s) given for {n} observation(s)")
-        begins = np.zeros(n, dtype=bool) if episode_start is None else np.asarray(episode_start, dtype=bool).reshape(n)
-        begins |= state is None
-        trips = [_Trip(self._first) if state is None or begins[i] else state[i] for i in range(n)]
+        begins = np.zeros(n, dtype=bool) if episode_start is None else np.array(episode_start, dtype=bool).reshape(n)
+        # Also after further practice, by which places are others
+        begins |= True if state is None else [len(each.plan.left) != len(self.graph) for each in state]
+        trips = [_Trip(self._first) if begins[i] or state is None else state[i] for i in range(n)]
         if self.modes_lead and self.targets is None and begins.any():
             best = self.model.mode_values(batch).argmax(axis=1).tolist()
             trips = [replace(each, mode=best[i]) if begins[i] else each for i, each in enumerate(trips)]
@@ -314,9 +332,9 @@ class ModePlanner:
         if trip.plan.after[ahead[-1]] < 0:
             points = np.concatenate((points, self._target(trip.stage, points[-1])[None]))
         points = points[1:] if len(points) > 1 else points
-        near = np.linalg.norm(points - position, axis=1) <= LOOK_AHEAD * graph.spacing
-        straight = np.flatnonzero(near & graph.sees(position, points))
-        return points[straight[-1]] if len(straight) else points[0]
+        near = points[np.linalg.norm(points - position, axis=1) <= LOOK_AHEAD * graph.spacing]
+        straight = near[graph.sees(position, near)] if len(near) else near
+        return straight[-1] if len(straight) else points[0]
 
     def _target(self, stage: int, position: np.ndarray) -> np.ndarray:
         """Where a trip ends that has come to the place of its target: there, or amid the ends of those that reached a goal."""
@@ -348,7 +366,25 @@ class ModePlanner:
         """
         self._check_ready()
         parts = {"graph": self.graph.state_dict(), "policy": self.policy.state_dict(), "travels": travels_state(self.travels)}
-        write(Path(path), _KIND, {"scale": self.scale, "crossing": self.crossing, "modes_lead": self.modes_lead, **parts})
+        write(
+            Path(path),
+            _KIND,
+            {
+                "scale": self.scale,
+                "crossing": self.crossing,
+                "modes_lead": self.modes_lead,
+                "features": self._selection,
+                **parts,
+            },
+        )
+
+    @property
+    def _selection(self) -> list[int] | str | None:
+        """Of the mode features; a callable has no name."""
+        selection = self.senses.features.selection
+        return (
+            selection if selection is None or isinstance(selection, str) else [] if callable(selection) else selection.tolist()
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike, model: Any, normalizer: VecNormalize | None = None) -> "ModePlanner":
@@ -367,6 +403,8 @@ class ModePlanner:
             planner.__init__(model, normalizer)  # type: ignore[misc]
         finally:
             model.replay_buffer = buffered
+        if state.features != planner._selection:
+            raise ValueError(f"planner.features: {state.features} given; accepted are the model's, {planner._selection}")
         dim = planner.senses.features.dim
         planner.scale = check_array(state.scale, np.float64, [dim], "planner.scale")
         if not (np.isfinite(planner.scale).all() and (planner.scale > 0).all() and 0 < state.crossing < np.inf):

@@ -120,8 +120,9 @@ class WaypointPolicy:
         for name, array in arrays.items():
             like = own[name] if name in own else own["net"][name]
             check_array(array, np.float32, list(like.shape), f"planner.policy.{name}")
-        if not all(np.isfinite(each).all() for each in arrays.values()) or not np.isfinite(state.pace):
-            raise ValueError("planner.policy: accepted are finite numbers")
+        finite = all(np.isfinite(each).all() for each in arrays.values()) and np.isfinite(state.pace)
+        if not finite or not (state.deviation > 0).all():
+            raise ValueError("planner.policy: accepted are finite numbers, and deviations above 0")
         self.horizon, self.pace = state.horizon, state.pace
         self.mean, self.deviation = th.from_numpy(state.mean.copy()), th.from_numpy(state.deviation.copy())
         self.net.load_state_dict({name: th.from_numpy(each.copy()) for name, each in state.net.items()})

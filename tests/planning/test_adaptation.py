@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from environments import TwoEnds, small_model
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_ddiffpg.planning import Adaptation, adapt
 
@@ -84,3 +84,21 @@ def test_refuses_what_cannot_work():
     ):
         with pytest.raises(ValueError, match=message):
             adapt(model, env, n)
+
+
+def test_some_speak_only_of_successes():
+    class Praises(Works):
+        def step(self, action):
+            *rest, info = super().step(action)
+            return *rest, info if info["is_success"] else {}
+
+    np.random.seed(0)
+    found = adapt(Stub(), DummyVecEnv([Praises]), 20)
+    assert found.mode == "mode_1" and found.n_successes["mode_1"] == found.n_trials["mode_1"]
+
+
+def test_a_normaliser_does_not_learn_from_trials():
+    env = VecNormalize(DummyVecEnv([Works]))
+    count = env.obs_rms.count
+    adapt(Stub(), env, 3)
+    assert env.obs_rms.count == count and env.training

@@ -206,12 +206,12 @@ def test_saves_and_loads(planner, tmp_path):
     obs = np.random.default_rng(0).uniform(0, 10, (20, 3)).astype(np.float32)
     np.testing.assert_array_equal(planner.predict(obs, deterministic=True)[0], again.predict(obs, deterministic=True)[0])
     again.practise(DummyVecEnv([TwoGaps]), 1)
-    assert len(again.travels) == len(planner.travels) + 3  # of the model, from place to place, and of the planner
+    assert len(again.travels) == len(planner.travels) + 1  # from place to place; there are no modes to compare
     whole = (tmp_path / "planner").read_bytes()
     (tmp_path / "damaged").write_bytes(whole[:-8] + bytes(8))
     with pytest.raises(ValueError, match="damaged"):
         ModePlanner.load(tmp_path / "damaged", planner.model)
-    with pytest.raises(ValueError, match=r"planner\..*shape"):
+    with pytest.raises(ValueError, match=r"planner\.(features|.*shape)"):
         ModePlanner.load(tmp_path / "planner", small_model(DummyVecEnv([TwoEnds])))
     with pytest.raises(FileNotFoundError):
         ModePlanner.load(tmp_path / "none", planner.model)
@@ -301,19 +301,77 @@ def test_a_mode_leads_until_it_does_not_get_on(planner):
     assert planner.go_to(GOAL).modes_lead is False
 
 
-@pytest.mark.parametrize(("of_model", "leads"), [(0.0, False), (1.0, False), (2.0, True)])
-def test_modes_lead_where_they_arrive_more_often(planner, of_model, leads, monkeypatch):
-    """The planner arrives always, so that only a model that were better than that would lead."""
+@pytest.mark.parametrize(("led", "alone", "leads"), [(0.9, 1.0, False), (1.0, 1.0, False), (1.0, 0.9, True)])
+@pytest.mark.parametrize("n_modes", [0, 2])
+def test_modes_lead_where_more_goals_are_reached_so(planner, led, alone, leads, n_modes, monkeypatch):
+    """Practised from place to place, led by modes, and alone; without modes there is nothing to compare."""
     agent = copy.copy(planner)
-    agent.policy = copy.deepcopy(planner.policy)
-    record = ModePlanner._record
-    shares = iter([of_model, None, None])
+    agent.policy, agent.model = copy.deepcopy(planner.policy), Leads(planner.model)
+    agent.model.modes = [None] * n_modes
+    record, asked = ModePlanner._record, []
 
-    def told(self, *args):
-        found = record(self, *args)
-        return found if (share := next(shares)) is None else share
+    def told(self, by, env, n_episodes):
+        record(self, by, env, n_episodes)
+        asked.append(self.modes_lead)
+        return {1: 0.0, 2: led, 3: alone}[len(asked)]
 
     monkeypatch.setattr(ModePlanner, "_record", told)
     np.random.seed(0)
     agent.practise(DummyVecEnv([TwoGaps]), 2)
-    assert agent.modes_lead is leads
+    assert agent.modes_lead is (leads and n_modes > 0) and asked == ([False, True, False] if n_modes else [False])
+
+
+class Breaks(TwoGaps):
+    """Not finite from the fifth step on."""
+
+    def step(self, action):
+        obs, *rest = super().step(action)
+        return obs * (np.nan if self.time > 4 else 1), *rest
+
+
+def test_nothing_is_learned_from_what_is_not_finite(planner):
+    agent, n = copy.copy(planner), len(planner.travels)
+    with pytest.raises(ValueError, match="finite"):
+        agent.practise(DummyVecEnv([Breaks]), 1)
+    assert len(agent.travels) == n
+    agent.predict(np.array([[*START, 0.5]], dtype=np.float32))
+
+
+def test_far_away_costs_no_more(planner):
+    """Lines that are longer than one goes straight are not looked along."""
+    for away in (1e3, 1e9):
+        actions, _ = planner.predict(np.array([[away, away, 0.5]], dtype=np.float32), deterministic=True)
+        assert np.isfinite(actions).all()
+
+
+def test_agents_keep_what_they_know(planner):
+    """Further practice, of the planner or of an agent, is that one's alone. Where an agent was on its way it begins anew."""
+    mine = copy.copy(planner)
+    mine.policy = copy.deepcopy(planner.policy)
+    agent, obs = mine.go_to(GOAL), np.array([[3.0, 2.0, 0.5]], dtype=np.float32)
+    before, state = agent.predict(obs, deterministic=True)
+    starts = np.zeros(1, dtype=bool)
+    mine.practise(DummyVecEnv([TwoGaps]), 1)
+    np.testing.assert_array_equal(agent.predict(obs, deterministic=True)[0], before)
+    mine.predict(obs, state, starts)
+    assert not starts.any()  # what was given stays as it is
+
+
+def test_an_environment_that_is_not_the_models_is_refused(planner):
+    normalized = VecNormalize(DummyVecEnv([TwoGaps]))
+    with pytest.raises(ValueError, match="normalised"):
+        planner.practise(normalized, 1)
+    other = copy.copy(planner)
+    other.resolved_features = [1, 2]
+    with pytest.raises(RuntimeError, match="features"):
+        other.practise(DummyVecEnv([TwoGaps]), 1)
+    for n in (0, True, 2.5):
+        with pytest.raises(ValueError, match="n_episodes"):
+            planner.practise(DummyVecEnv([TwoGaps]), n)
+
+
+def test_a_file_of_other_features_is_refused(planner, tmp_path):
+    planner.save(tmp_path / "planner")
+    other = small_model(DummyVecEnv([TwoGaps]), mode_features=[1, 2])
+    with pytest.raises(ValueError, match=r"features: \[0, 1\] given; accepted are the model's, \[1, 2\]"):
+        ModePlanner.load(tmp_path / "planner", other)

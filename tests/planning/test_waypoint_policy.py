@@ -58,6 +58,7 @@ def test_comes_back_from_plain_values_and_refuses_others():
         ({"horizon": 0}, "horizon"),
         ({"mean": state["mean"][:2]}, "shape"),
         ({"pace": float("nan")}, "finite"),
+        ({"deviation": 0 * state["deviation"]}, "above 0"),
     ):
         with pytest.raises(ValueError, match=message):
             other.load_state_dict({**state, **changed})
