@@ -364,27 +364,7 @@ class ModePlanner:
         :param path: Of the file, a safetensors file without code
         :raises OSError: If it cannot be written; what was there before still is
         """
-        self._check_ready()
-        parts = {"graph": self.graph.state_dict(), "policy": self.policy.state_dict(), "travels": travels_state(self.travels)}
-        write(
-            Path(path),
-            _KIND,
-            {
-                "scale": self.scale,
-                "crossing": self.crossing,
-                "modes_lead": self.modes_lead,
-                "features": self._selection,
-                **parts,
-            },
-        )
-
-    @property
-    def _selection(self) -> list[int] | str | None:
-        """Of the mode features; a callable has no name."""
-        selection = self.senses.features.selection
-        return (
-            selection if selection is None or isinstance(selection, str) else [] if callable(selection) else selection.tolist()
-        )
+        write(Path(path), _KIND, self.state_dict())
 
     @classmethod
     def load(cls, path: str | os.PathLike, model: Any, normalizer: VecNormalize | None = None) -> "ModePlanner":
@@ -395,24 +375,50 @@ class ModePlanner:
         :return: A planner that knows what that one knew
         :raises ValueError: If the file is damaged, or of a model with other spaces
         """
-        state = convert(read(Path(path), _KIND), _State, "planner")
-        planner = cls.__new__(cls)
-        buffered = model.replay_buffer
+        tree = read(Path(path), _KIND)
+        planner, buffered = cls.__new__(cls), model.replay_buffer
         try:
             model.replay_buffer = None  # what it holds is not to be learned anew
             planner.__init__(model, normalizer)  # type: ignore[misc]
         finally:
             model.replay_buffer = buffered
-        if state.features != planner._selection:
-            raise ValueError(f"planner.features: {state.features} given; accepted are the model's, {planner._selection}")
-        dim = planner.senses.features.dim
-        planner.scale = check_array(state.scale, np.float64, [dim], "planner.scale")
-        if not (np.isfinite(planner.scale).all() and (planner.scale > 0).all() and 0 < state.crossing < np.inf):
-            raise ValueError("planner: accepted are a positive scale and crossing")
-        planner.crossing, planner.modes_lead = state.crossing, state.modes_lead and len(getattr(model, "modes", ())) > 0
-        planner.travels = travels_of_state(state.travels, planner.senses.n_inputs, dim, planner._action_dim)
-        planner.graph = PlaceGraph.from_state(state.graph, dim)
-        planner.policy = WaypointPolicy(planner.senses.n_inputs, dim, planner._action_dim, horizon=1)
-        planner.policy.load_state_dict(state.policy)
-        planner._plan_first()
+        planner.load_state_dict(tree)
         return planner
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: What it knows, in plain values and arrays
+        :raises RuntimeError: If that is nothing
+        """
+        self._check_ready()
+        parts = {"graph": self.graph.state_dict(), "policy": self.policy.state_dict(), "travels": travels_state(self.travels)}
+        settings = {"crossing": self.crossing, "modes_lead": self.modes_lead, "features": self._selection}
+        return {"scale": self.scale, **settings, **parts}
+
+    def load_state_dict(self, tree: Any) -> None:
+        """
+        :param tree: What ``state_dict`` gave, of a planner for the same model
+        :raises ValueError: If it is something else
+        """
+        state = convert(tree, _State, "planner")
+        if state.features != self._selection:
+            raise ValueError(f"planner.features: {state.features} given; accepted are the model's, {self._selection}")
+        dim = self.senses.features.dim
+        scale = check_array(state.scale, np.float64, [dim], "planner.scale")
+        if not (np.isfinite(scale).all() and (scale > 0).all() and 0 < state.crossing < np.inf):
+            raise ValueError("planner: accepted are a positive scale and crossing")
+        policy = WaypointPolicy(self.senses.n_inputs, dim, self._action_dim, horizon=1)
+        policy.load_state_dict(state.policy)
+        graph = PlaceGraph.from_state(state.graph, dim)
+        self.travels = travels_of_state(state.travels, self.senses.n_inputs, dim, self._action_dim)
+        self.scale, self.graph, self.policy, self.crossing = scale, graph, policy, state.crossing
+        self.modes_lead = state.modes_lead and len(getattr(self.model, "modes", ())) > 0
+        self._plan_first()
+
+    @property
+    def _selection(self) -> list[int] | str | None:
+        """Of the mode features; a callable cannot be told."""
+        selection = self.senses.features.selection
+        if selection is None or isinstance(selection, str):
+            return selection
+        return [] if callable(selection) else selection.tolist()
