@@ -24,7 +24,6 @@ class FifoReplayBuffer(ModeReplayBuffer):
     """A ``ModeReplayBuffer`` without modes and target actions: the trajectory that ended first is the first to go."""
 
     target_action_fields: tuple[str, ...] = ()
-    has_modes = False
     constant_notes: ClassVar[dict[str, Any]] = {
         **{"off_mode_success": False, "off_route": False, "route_novelty": 0.0},
         **{"followed": NO_ROUTE, "counted": True},

@@ -33,8 +33,6 @@ class AssignedReplayBuffer(PathReplayBuffer):
 
     #: Stored beside each action, for algorithms that improve them: of the mode that owns it, and of the exploratory group
     target_action_fields: tuple[str, ...] = ("target_actions", "exploratory_target_actions")
-    #: Whether the algorithm has modes; only then are their notes stored, and trajectories told of other goals
-    has_modes: bool = True
     target_actions: Any
     exploratory_target_actions: Any
     off_mode_success: np.ndarray
@@ -89,6 +87,11 @@ class AssignedReplayBuffer(PathReplayBuffer):
         self.hindsight = Hindsight.of(env) if self.has_modes else None
         if self.hindsight is not None:
             self.hindsight.judge(self)
+
+    @property
+    def has_modes(self) -> bool:
+        """Whether the algorithm has modes; only then are their notes stored, and trajectories told of other goals."""
+        return not self.constant_notes
 
     @property
     def has_hindsight(self) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_ddiffpg.evaluation.task import Task
 
@@ -64,3 +64,22 @@ def evaluation_environments(
     if env_kwargs:
         raise ValueError(f"{sorted(env_kwargs)} given; accepted beside an env that is made already are none")
     yield env
+
+
+@contextmanager
+def frozen_statistics(env: VecEnv) -> Iterator[VecNormalize | None]:
+    """
+    Test episodes are not what a normaliser's statistics are of.
+
+    :param env: Vectorised environments
+    :return: Their normaliser, which learns nothing inside; None if they have none
+    """
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is None:
+        yield None
+        return
+    was_training, normalizer.training = normalizer.training, False
+    try:
+        yield normalizer
+    finally:
+        normalizer.training = was_training

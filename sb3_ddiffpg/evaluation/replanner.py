@@ -4,37 +4,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space, maybe_transpose
-from stable_baselines3.common.utils import is_vectorized_observation
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_ddiffpg.buffers.features import ModeFeatures
+from sb3_ddiffpg.evaluation.acting import as_batch, normalizer_of, unnormalized
 
 Observation = np.ndarray | dict[str, np.ndarray]
-
-
-def _as_stored(observation: Any, space: spaces.Space) -> Any:
-    """Images of an environment by itself have their channels last, those of a model's first."""
-    return maybe_transpose(np.asarray(observation), space) if is_image_space(space) else observation
-
-
-def as_batch(space: spaces.Space, observation: Any) -> tuple[Any, bool]:
-    """
-    :param space: Of the model
-    :param observation: One observation or a batch of N
-    :return: The batch, images with their channels as the model has them, and whether one was given
-    """
-    if isinstance(observation, dict):
-        parts: Any = space
-        observation = {key: _as_stored(value, parts[key]) for key, value in observation.items()}
-    else:
-        observation = _as_stored(observation, space)
-    if is_vectorized_observation(observation, space):
-        return observation, False
-    if isinstance(observation, dict):
-        return {key: np.asarray(value)[None] for key, value in observation.items()}, True
-    return np.asarray(observation)[None], True
 
 
 class Replanner:
@@ -68,11 +43,7 @@ class Replanner:
             raise ValueError(f"model: a {type(model).__name__} without modes given; there is nothing to switch to")
         if patience < 1:
             raise ValueError(f"patience: {patience} given; accepted are whole numbers from 1 up")
-        self.normalizer = model.get_vec_normalize_env() if normalizer is None else normalizer
-        if self.normalizer is None and model.is_normalized:
-            raise ValueError(
-                "normalizer: None given, but the model was trained on normalised observations and has no environment"
-            )
+        self.normalizer = normalizer_of(model, normalizer)
         self.model = model
         self.patience = patience
         self.success_key = model.success_key
@@ -171,4 +142,4 @@ class Replanner:
         return np.tile(-np.arange(len(self.ranked), dtype=float), (n, 1))
 
     def _positions(self, batch: Any) -> np.ndarray:
-        return self.features(batch if self.normalizer is None else self.normalizer.unnormalize_obs(batch))
+        return self.features(unnormalized(batch, self.normalizer))

@@ -6,11 +6,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_ddiffpg.buffers.features import ModeFeatures, declared_mode_features
 from sb3_ddiffpg.buffers.success import GoalWatch
-from sb3_ddiffpg.evaluation.environments import evaluation_environments
+from sb3_ddiffpg.evaluation.environments import evaluation_environments, frozen_statistics
 from sb3_ddiffpg.utils.vec_envs import env_attribute, labels_routes
 
 
@@ -54,7 +54,23 @@ def run_episodes(
     if not isinstance(env, VecEnv):
         with evaluation_environments(model, env, n_episodes) as made:
             return run_episodes(model, made, n_episodes, mode, deterministic)
-    share = np.array([n_episodes // env.num_envs + (i < n_episodes % env.num_envs) for i in range(env.num_envs)])
+    with frozen_statistics(env) as normalizer:
+        return _run(model, env, n_episodes, mode, deterministic, normalizer)
+
+
+def episode_shares(n_episodes: int, n_envs: int) -> list[int]:
+    """
+    :param n_episodes: Number of episodes
+    :param n_envs: Number of environments
+    :return: How many of the episodes each environment runs, its first ones
+    """
+    return [n_episodes // n_envs + (i < n_episodes % n_envs) for i in range(n_envs)]
+
+
+def _run(
+    model: Any, env: VecEnv, n_episodes: int, mode: str | int | None, deterministic: bool, normalizer: VecNormalize | None
+) -> list[EpisodeResult]:
+    share = episode_shares(n_episodes, env.num_envs)
     selection = getattr(model, "resolved_features", None)
     if selection is None and env_attribute(env, "mode_features") is not None:
         with suppress(ValueError):  # of what wrappers have made unknown: the whole observation
@@ -65,10 +81,6 @@ def run_episodes(
     watch = GoalWatch(env.num_envs, getattr(model, "success_key", None), labels_routes(env))
     watch.has_signal = knows_success(model)
     # Positions are compared in metres, whatever a normalising wrapper shows the networks
-    normalizer = unwrap_vec_normalize(env)
-    was_training = normalizer is not None and normalizer.training
-    if normalizer is not None:
-        normalizer.training = False  # test episodes are not what the statistics are of
     obs, state, starts = env.reset(), None, np.ones(env.num_envs, dtype=bool)
     original = obs if normalizer is None else normalizer.get_original_obs()
     paths: list[list[np.ndarray]] = [[position] for position in features(original)]  # type: ignore[arg-type]
@@ -94,8 +106,6 @@ def run_episodes(
             results[i].append(EpisodeResult(success, len(path) - 1, float(returns[i]), label, path))
             watch.end(i)
             paths[i], returns[i] = [positions[i]], 0.0
-    if normalizer is not None:
-        normalizer.training = was_training
     found = [episode for done, wanted in zip(results, share, strict=True) for episode in done[:wanted]]
     return judged(found, watch.has_signal)
 

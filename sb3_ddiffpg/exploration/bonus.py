@@ -35,10 +35,14 @@ _SAMPLE = 20_000
 class Notes(Protocol):
     """What the bonus notes of each stored step, by row: arrays of a replay buffer. Without modes there are no known routes."""
 
-    has_modes: bool
     first_visits: np.ndarray
     followed: np.ndarray
     counted: np.ndarray
+
+    @property
+    def has_modes(self) -> bool:
+        """Whether the algorithm has modes."""
+        ...
 
 
 class ExplorationBonus:

@@ -6,10 +6,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from scipy.stats import binomtest
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_ddiffpg.evaluation.environments import evaluation_environments
+from sb3_ddiffpg.evaluation.environments import evaluation_environments, frozen_statistics
 from sb3_ddiffpg.evaluation.rollout import run_episodes
+from sb3_ddiffpg.utils.settings import at_least
 
 
 @dataclass(frozen=True)
@@ -58,13 +59,13 @@ def adapt(model: Any, env: gym.Env | VecEnv | str, n_trials: int = 20) -> Adapta
     """
     if not len(getattr(model, "modes", ())):
         raise ValueError(f"model: a {type(model).__name__} without modes given; there is nothing to choose from")
-    if isinstance(n_trials, bool) or not isinstance(n_trials, (int, np.integer)) or n_trials < 1:
-        raise ValueError(f"n_trials: {n_trials!r} given; accepted are whole numbers from 1 up")
+    at_least(1).check("n_trials", n_trials)
     if not isinstance(env, VecEnv):
         with evaluation_environments(model, env, 1) as made:
             return adapt(model, made, n_trials)
     names = [mode.name for mode in model.modes]
-    values = model.mode_values(_first_observations(env)).mean(axis=0)
+    with frozen_statistics(env):
+        values = model.mode_values(env.reset()).mean(axis=0)
     spread = np.ptp(values)
     prior = (values - values.min()) / spread if spread > 0 else np.full(len(names), 0.5)
     told = False
@@ -80,15 +81,3 @@ def adapt(model: Any, env: gym.Env | VecEnv | str, n_trials: int = 20) -> Adapta
     best = int(((1 + prior + wins) / (3 + wins + losses)).argmax())
     trials = dict(zip(names, (wins + losses).tolist(), strict=True))
     return Adaptation(names[best], trials, dict(zip(names, wins.tolist(), strict=True)))
-
-
-def _first_observations(env: VecEnv) -> Any:
-    """Of new episodes, of which the statistics of a normaliser do not hear."""
-    normalizer = unwrap_vec_normalize(env)
-    if normalizer is None:
-        return env.reset()
-    was_training, normalizer.training = normalizer.training, False
-    try:
-        return env.reset()
-    finally:
-        normalizer.training = was_training

@@ -10,11 +10,12 @@ from typing import Any
 import gymnasium as gym
 import msgspec
 import numpy as np
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_ddiffpg.buffers.features import same_selection
+from sb3_ddiffpg.evaluation.acting import as_batch, normalizer_of, unnormalized
 from sb3_ddiffpg.evaluation.environments import evaluation_environments
-from sb3_ddiffpg.evaluation.replanner import as_batch
 from sb3_ddiffpg.planning.place_graph import RESOLUTION, PlaceGraph, Plan
 from sb3_ddiffpg.planning.practice import Wanderer
 from sb3_ddiffpg.planning.travels import (
@@ -28,6 +29,7 @@ from sb3_ddiffpg.planning.travels import (
 )
 from sb3_ddiffpg.planning.waypoint_policy import WaypointPolicy
 from sb3_ddiffpg.serialization.safetensors_tree import check_array, convert, read, write
+from sb3_ddiffpg.utils.settings import at_least
 
 #: Gradient steps of the waypoint policy, each time that it learns
 N_UPDATES = 2000
@@ -101,15 +103,19 @@ class ModePlanner:
     crossing: float
 
     def __init__(self, model: Any, normalizer: VecNormalize | None = None) -> None:
+        self._follow(model, normalizer)
+        buffer = getattr(model, "replay_buffer", None)
+        self.travels = stored_travels(buffer, self.senses) if buffer is not None and buffer.size() else []
+        if self.travels:
+            self._learn()
+
+    def _follow(self, model: Any, normalizer: VecNormalize | None) -> None:
+        """Be the planner of a model, without any knowledge."""
         if not hasattr(model, "resolved_features"):
             raise ValueError(
                 f"model: a {type(model).__name__} given; accepted is a DDiffPG, whose mode features say where it is"
             )
-        self.normalizer = model.get_vec_normalize_env() if normalizer is None else normalizer
-        if self.normalizer is None and model.is_normalized:
-            raise ValueError(
-                "normalizer: None given, but the model was trained on normalised observations and has no environment"
-            )
+        self.normalizer = normalizer_of(model, normalizer)
         self.model = model
         self.success_key, self.resolved_features = model.success_key, model.resolved_features
         self.senses = Senses(model.observation_space, self.resolved_features)
@@ -117,10 +123,6 @@ class ModePlanner:
         self.targets: np.ndarray | None = None
         #: Whether an episode to a goal begins with a mode
         self.modes_lead = False
-        buffer = getattr(model, "replay_buffer", None)
-        self.travels = stored_travels(buffer, self.senses) if buffer is not None and buffer.size() else []
-        if self.travels:
-            self._learn()
 
     # ------------------------------------------------------------------ learning
 
@@ -133,10 +135,11 @@ class ModePlanner:
         :param n_episodes: Number of episodes of each kind
         :return: Squared error of the waypoint policy's actions
         """
+        at_least(1).check("n_episodes", n_episodes)
         if not isinstance(env, VecEnv):
-            with evaluation_environments(self.model, env, max(n_episodes, 1)) as made:
+            with evaluation_environments(self.model, env, n_episodes) as made:
                 return self.practise(made, n_episodes)
-        self._check_practice(env, n_episodes)
+        self._check_practice(env)
         if not self.travels:
             self._record(self.model, env, n_episodes)
             self._learn()
@@ -149,9 +152,7 @@ class ModePlanner:
             self.modes_lead = success[True] > success[False]
         return error
 
-    def _check_practice(self, env: VecEnv, n_episodes: int) -> None:
-        if isinstance(n_episodes, bool) or not isinstance(n_episodes, (int, np.integer)) or n_episodes < 1:
-            raise ValueError(f"n_episodes: {n_episodes!r} given; accepted are whole numbers from 1 up")
+    def _check_practice(self, env: VecEnv) -> None:
         if not same_selection(self.model.resolved_features, self.resolved_features):
             raise RuntimeError("The model's mode features are others since this planner was made: make another")
         if (self.normalizer is None) != (unwrap_vec_normalize(env) is None):
@@ -183,14 +184,14 @@ class ModePlanner:
         self.crossing = float(self.graph.spacing / max(steps.mean(), 1e-9))
         if not hasattr(self, "policy"):
             horizon = max(round(LOOK_AHEAD * self.crossing), 1)
-            self.policy = WaypointPolicy(self.senses.n_inputs, self.senses.features.dim, self._action_dim, horizon)
+            self.policy = self._new_policy(horizon)
         error = self.policy.fit(self.travels, self.scale, N_UPDATES)
         self._plan_first()
         return error
 
-    @property
-    def _action_dim(self) -> int:
-        return int(np.prod(self.model.action_space.shape))
+    def _new_policy(self, horizon: int) -> WaypointPolicy:
+        action_dim = get_action_dim(self.model.action_space)
+        return WaypointPolicy(self.senses.n_inputs, self.senses.features.dim, action_dim, horizon)
 
     # ------------------------------------------------------------------ where to
 
@@ -238,7 +239,7 @@ class ModePlanner:
         :param observation: As the model sees it
         :return: As the environment made it
         """
-        return observation if self.normalizer is None else self.normalizer.unnormalize_obs(observation)
+        return unnormalized(observation, self.normalizer)
 
     def act(self, original: Any, directions: np.ndarray, noise: np.ndarray | float) -> np.ndarray:
         """
@@ -376,12 +377,8 @@ class ModePlanner:
         :raises ValueError: If the file is damaged, or of a model with other spaces
         """
         tree = read(Path(path), _KIND)
-        planner, buffered = cls.__new__(cls), model.replay_buffer
-        try:
-            model.replay_buffer = None  # what it holds is not to be learned anew
-            planner.__init__(model, normalizer)  # type: ignore[misc]
-        finally:
-            model.replay_buffer = buffered
+        planner = cls.__new__(cls)
+        planner._follow(model, normalizer)  # what its replay buffer holds is not to be learned anew
         planner.load_state_dict(tree)
         return planner
 
@@ -407,10 +404,10 @@ class ModePlanner:
         scale = check_array(state.scale, np.float64, [dim], "planner.scale")
         if not (np.isfinite(scale).all() and (scale > 0).all() and 0 < state.crossing < np.inf):
             raise ValueError("planner: accepted are a positive scale and crossing")
-        policy = WaypointPolicy(self.senses.n_inputs, dim, self._action_dim, horizon=1)
+        policy = self._new_policy(horizon=1)
         policy.load_state_dict(state.policy)
         graph = PlaceGraph.from_state(state.graph, dim)
-        self.travels = travels_of_state(state.travels, self.senses.n_inputs, dim, self._action_dim)
+        self.travels = travels_of_state(state.travels, self.senses.n_inputs, dim, get_action_dim(self.model.action_space))
         self.scale, self.graph, self.policy, self.crossing = scale, graph, policy, state.crossing
         self.modes_lead = state.modes_lead and len(getattr(self.model, "modes", ())) > 0
         self._plan_first()

@@ -11,7 +11,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_ddiffpg.buffers.features import ModeFeatures
-from sb3_ddiffpg.evaluation.rollout import run_episodes
+from sb3_ddiffpg.evaluation.rollout import episode_shares, run_episodes
 from sb3_ddiffpg.serialization.safetensors_tree import check_array, convert
 
 #: Steps that are remembered, of the newest episodes
@@ -170,8 +170,8 @@ def recorded_travels(
     """
     recorder = _Recorder(agent, model, senses, original)
     results = run_episodes(recorder, env, n_episodes)
-    share = [n_episodes // env.num_envs + (i < n_episodes % env.num_envs) for i in range(env.num_envs)]
-    records = [record for own, n in zip(recorder.episodes, share, strict=True) for record in own[:n]]
+    shares = episode_shares(n_episodes, env.num_envs)
+    records = [record for own, n in zip(recorder.episodes, shares, strict=True) for record in own[:n]]
     travels = []
     for record, result in zip(records, results, strict=True):
         inputs, actions = (np.array(part) for part in zip(*record[: result.length], strict=True))

@@ -6,7 +6,7 @@ import pytest
 from environments import TwoEnds, small_model
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from test_rollout import Scripted
 
 from sb3_ddiffpg import EvaluateModesCallback, ModeFigureCallback
@@ -80,3 +80,21 @@ def test_what_is_no_environment(env, trained):
         (ValueError, ModuleNotFoundError), match=r"env must be a VecEnv, a gymnasium.Env or the id|no module|env: not given"
     ):
         run_episodes(trained, env, 1)
+
+
+def test_statistics_learn_again_after_a_test_that_breaks_off():
+    """Whatever ends it: the run that it was a test of goes on learning them."""
+    env = VecNormalize(DummyVecEnv([TwoEnds]))
+
+    class Breaks:
+        def predict(self, *args, **kwargs):
+            raise ArithmeticError
+
+    count = env.obs_rms.count
+    with pytest.raises(ArithmeticError):
+        run_episodes(Breaks(), env, 1)
+    assert env.training and env.obs_rms.count == count
+    env.training = False  # and stay as they are where they learned nothing
+    with pytest.raises(ArithmeticError):
+        run_episodes(Breaks(), env, 1)
+    assert not env.training
